@@ -1,0 +1,1 @@
+"""Least squares over many poses and landmarks; knows arrays, not maps."""

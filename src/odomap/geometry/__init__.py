@@ -1,0 +1,1 @@
+"""Pure mathematics of pose and camera."""

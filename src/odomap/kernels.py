@@ -1,0 +1,80 @@
+"""Compiled inner loops: `@kernel` is numba's njit without the GIL, cached on disk.
+
+A kernel takes arrays and scalars only, allocates nothing in its loops, and says its formula in its
+docstring. Kernels release the GIL, so that tracking, mapping and closing can run side by side, and
+never use numba's own threads (`parallel=True` aborts when several Python threads call it).
+
+A module that has kernels also has a function `warm_up()`, which calls each of them once on a
+handful of numbers with the types used in earnest: that compiles them, or loads them from the cache.
+With the environment variable ODOMAP_PLAIN=1 kernels are plain Python: slow, but a debugger can step
+through them.
+"""
+
+import importlib
+import os
+import pkgutil
+import time
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+__all__ = ["clear_cache", "kernel", "modules_with_kernels", "warm_up"]
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def _is_plain() -> bool:
+    return os.environ.get("ODOMAP_PLAIN", "") not in ("", "0")
+
+
+def kernel(function: F) -> F:
+    """Compile a function of arrays and scalars: no GIL, cached, IEEE division as NumPy does it."""
+    if _is_plain():
+        return function
+    import numba
+
+    compiled: F = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+    return compiled
+
+
+def modules_with_kernels() -> Iterator[str]:
+    """Yield the dotted names of all modules of the package that define `warm_up`, lowest floor first."""
+    import odomap
+
+    for info in sorted(pkgutil.walk_packages(odomap.__path__, "odomap."), key=lambda i: i.name):
+        if info.name.split(".")[-1].startswith("_") or info.name == __name__:
+            continue
+        spec = info.module_finder.find_spec(info.name, None)  # type: ignore[call-arg]
+        source = getattr(spec.loader, "get_source", lambda name: None)(info.name) if spec else None
+        if source and "\ndef warm_up(" in source:
+            yield info.name
+
+
+def warm_up(name: str) -> float:
+    """Compile (or load from the cache) all kernels of one module.
+
+    Args:
+        name: dotted module name, as `modules_with_kernels` yields them.
+
+    Returns:
+        Seconds it took.
+    """
+    start = time.perf_counter()
+    importlib.import_module(name).warm_up()
+    return time.perf_counter() - start
+
+
+def clear_cache() -> int:
+    """Delete the compiled kernels kept beside the package, and return how many files went.
+
+    Numba does not see edits in functions that a cached kernel calls: clear after changing one.
+    """
+    import odomap
+
+    removed = 0
+    for folder in odomap.__path__:
+        for root, _, names in os.walk(folder):
+            for name in names:
+                if name.endswith((".nbi", ".nbc")):
+                    os.remove(os.path.join(root, name))
+                    removed += 1
+    return removed

@@ -1,0 +1,1 @@
+"""What is remembered: keyframes, landmarks, observations, states."""

@@ -1,0 +1,1 @@
+"""What arrives: rigs, frames, and their synchronisation."""

@@ -1,0 +1,1 @@
+"""What decides: tracking, odometry, workers, configuration."""
