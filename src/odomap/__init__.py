@@ -1,3 +1,133 @@
-"""odomap: SLAM in Python for cameras, LiDAR and IMU."""
+"""odomap: SLAM in Python for cameras, LiDAR and IMU.
 
-__version__ = "0.1.0"
+    import odomap
+
+    source = odomap.open("MH_01_easy")         # a recording's folder, or "sim:room?seed=3"
+    system = odomap.StereoVO(source.rig)
+    for frame in source:
+        estimate = system.track(frame)         # .T_world_body, .status, .reason, .covariance
+    odomap.write_tum("poses.tum", system.finish().trajectory)
+
+Or in one line, with all outputs in a folder: ``odomap.run("MH_01_easy", "runs/mh01")``.
+
+Names are loaded on first use, so that importing the package costs milliseconds and pulls in
+neither numba nor OpenCV. This module is the face: nothing inside the package imports it.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from odomap.version import __version__
+
+if TYPE_CHECKING:
+    from odomap.errors import (
+        CalibrationError,
+        ConfigError,
+        InputError,
+        MissingExtra,
+        OdomapError,
+        OutputError,
+        TrackingFailed,
+    )
+    from odomap.evaluation.metrics import ate, rpe
+    from odomap.files.rig import read_rig, write_rig
+    from odomap.files.trajectories import read_tum, write_tum
+    from odomap.geometry.camera import Camera
+    from odomap.geometry.pose import SE2, SE3, SO3, Sim3
+    from odomap.geometry.trajectory import Trajectory
+    from odomap.maps.estimate import Estimate, Status
+    from odomap.maps.map import Map
+    from odomap.run import run
+    from odomap.sensors.frame import Frame
+    from odomap.sensors.rig import Rig
+    from odomap.simulation.world import World
+    from odomap.sources.open import open
+    from odomap.sources.source import Source
+    from odomap.system.config import Config, preset
+    from odomap.system.odometry import Result, StereoVO
+
+__all__ = [
+    "SE2",
+    "SE3",
+    "SO3",
+    "CalibrationError",
+    "Camera",
+    "Config",
+    "ConfigError",
+    "Estimate",
+    "Frame",
+    "InputError",
+    "Map",
+    "MissingExtra",
+    "OdomapError",
+    "OutputError",
+    "Result",
+    "Rig",
+    "Sim3",
+    "Source",
+    "Status",
+    "StereoVO",
+    "TrackingFailed",
+    "Trajectory",
+    "World",
+    "__version__",
+    "ate",
+    "open",
+    "preset",
+    "read_rig",
+    "read_tum",
+    "rpe",
+    "run",
+    "write_rig",
+    "write_tum",
+]
+
+_HOMES = {
+    "CalibrationError": "errors",
+    "Camera": "geometry.camera",
+    "Config": "system.config",
+    "ConfigError": "errors",
+    "Estimate": "maps.estimate",
+    "Frame": "sensors.frame",
+    "InputError": "errors",
+    "Map": "maps.map",
+    "MissingExtra": "errors",
+    "OdomapError": "errors",
+    "OutputError": "errors",
+    "Result": "system.odometry",
+    "Rig": "sensors.rig",
+    "SE2": "geometry.pose",
+    "SE3": "geometry.pose",
+    "SO3": "geometry.pose",
+    "Sim3": "geometry.pose",
+    "Source": "sources.source",
+    "Status": "maps.estimate",
+    "StereoVO": "system.odometry",
+    "TrackingFailed": "errors",
+    "Trajectory": "geometry.trajectory",
+    "World": "simulation.world",
+    "ate": "evaluation.metrics",
+    "open": "sources.open",
+    "preset": "system.config",
+    "read_rig": "files.rig",
+    "read_tum": "files.trajectories",
+    "rpe": "evaluation.metrics",
+    "run": "run",
+    "write_rig": "files.rig",
+    "write_tum": "files.trajectories",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its room the first time it is asked for (PEP 562)."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'odomap' has no attribute {name!r}")
+    value: object = getattr(import_module(f"odomap.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted(__all__)
