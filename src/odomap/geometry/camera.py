@@ -7,10 +7,10 @@ form. For the pinhole model with radial-tangential distortion, with x = X/Z, y =
     x' = g x + 2p₁xy + p₂(r² + 2x²),   y' = g y + p₁(r² + 2y²) + 2p₂xy
     u  = fx x' + cx,   v = fy y' + cy
 
-`undistort` inverts it by Newton's method with the exact 2x2 Jacobian: quadratic, 4 steps for a wide
-lens, all points at once. The polynomial is only a lens up to the radius where r·g(r²) stops growing;
-beyond it far-off points would fold back into the image, so they project to NaN, as do points behind
-the camera. Other lenses are one entry in `MODELS`. O(N), NumPy.
+`undistort` inverts it by Newton's method with the exact 2x2 Jacobian: quadratic, four steps for a
+wide lens. The polynomial is a lens only up to the radius where r·g(r²) stops growing; beyond it
+far-off points would fold back into the image, so they project to NaN, as do points behind the
+camera. Other lenses are one entry in `MODELS`. O(N).
 
 Reference: D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971;
 J. Heikkilä, O. Silvén, "A four-step camera calibration procedure", CVPR 1997.
@@ -34,13 +34,19 @@ __all__ = ["MODELS", "Camera", "LensModel", "RadialTangential"]
 class LensModel(Protocol):
     """What a lens must know: rays to the plane at focal length 1, and back.
 
-    Attributes:
-        lengths: allowed numbers of distortion coefficients.
+    Methods take the coefficients and what `reach` made of them.
     """
 
-    lengths: tuple[int, ...]
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Allowed numbers of distortion coefficients."""
+        ...
 
-    def to_plane(self, points: Array, distortion: Array) -> Array:
+    def reach(self, distortion: Array) -> float:
+        """Return how far from the axis the model is one-to-one, in the lens's own measure."""
+        ...
+
+    def to_plane(self, points: Array, distortion: Array, reach: float) -> Array:
         """Map points (N, 3) to the plane (N, 2); NaN where the lens cannot see them."""
         ...
 
@@ -48,7 +54,7 @@ class LensModel(Protocol):
         """Return the derivative of `to_plane` by the points, (N, 2, 3)."""
         ...
 
-    def from_plane(self, plane: Array, distortion: Array) -> Array:
+    def from_plane(self, plane: Array, distortion: Array, reach: float) -> Array:
         """Map the plane (N, 2) to rays (N, 3) of any length; NaN where no ray leads there."""
         ...
 
@@ -56,17 +62,33 @@ class LensModel(Protocol):
 class RadialTangential:
     """The pinhole with radial-tangential distortion (k1 k2 p1 p2 [k3 [k4 k5 k6]])."""
 
-    lengths = (0, 4, 5, 8)
+    lengths: tuple[int, ...] = (0, 4, 5, 8)
 
-    def to_plane(self, points: Array, distortion: Array) -> Array:
+    def reach(self, distortion: Array) -> float:
+        """Return the r² at which r·g(r²) stops growing, infinity if it never does."""
+        k = np.pad(distortion, (0, 8 - len(distortion)))
+        up = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
+        down = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
+        # d/dr [r g(r²)] = 0, times the denominator squared, as a polynomial in s = r².
+        s = np.polynomial.Polynomial([0.0, 1.0])
+        growth = up * down + 2.0 * s * (up.deriv() * down - up * down.deriv())
+        roots = np.concatenate([growth.trim().roots(), down.trim().roots()])
+        real = roots[np.abs(np.imag(roots)) < 1e-9].real
+        return float(np.min(real[real > 0], initial=np.inf))
+
+    def to_plane(self, points: Array, distortion: Array, reach: float) -> Array:
         """Map points (N, 3) to the plane (N, 2); NaN behind the camera or beyond the fold."""
-        z = points[:, 2]
-        ahead = z > 0
-        xy = points[:, :2] / np.where(ahead, z, np.nan)[:, None]
+        xy = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
         if len(distortion) == 0:
             return np.asarray(xy)
-        seen = np.sum(xy * xy, axis=1) < self._fold(distortion)
-        return np.where(seen[:, None], self._distort(xy, distortion), np.nan)
+        x, y = xy[:, 0], xy[:, 1]
+        p1, p2 = distortion[2:4]
+        r2 = x * x + y * y
+        g, _ = _radial(np.where(r2 < reach, r2, np.nan), distortion)
+        out = np.empty_like(xy)
+        out[:, 0] = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        out[:, 1] = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        return out
 
     def to_plane_jacobian(self, points: Array, distortion: Array) -> Array:
         """Return the derivative of `to_plane` by the points, (N, 2, 3)."""
@@ -77,86 +99,49 @@ class RadialTangential:
         out[:, :, 2] = -(out[:, :, :2] @ xy[:, :, None])[:, :, 0]
         return out
 
-    def from_plane(self, plane: Array, distortion: Array) -> Array:
+    def from_plane(self, plane: Array, distortion: Array, reach: float) -> Array:
         """Map the plane (N, 2) to rays (x, y, 1)."""
-        xy = plane if len(distortion) == 0 else self._undistort(plane, distortion)
-        return np.concatenate([xy, np.ones((len(plane), 1))], axis=1)
+        rays = np.ones((len(plane), 3))
+        if len(distortion) == 0:
+            rays[:, :2] = plane
+            return rays
+        from odomap.geometry.lens_kernels import radtan_undistort_rows
+
+        padded = np.zeros(8)
+        padded[: len(distortion)] = distortion
+        xy = np.empty_like(plane)
+        radtan_undistort_rows(np.ascontiguousarray(plane), padded, reach, xy)
+        rays[:, :2] = xy
+        return rays
 
     @staticmethod
-    def _radial(r2: Array, distortion: Array) -> tuple[Array, Array]:
-        """Return g(r²) and its derivative by r²."""
-        k1, k2, _, _, k3, k4, k5, k6 = np.pad(distortion, (0, 8 - len(distortion)))
-        up = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        d_up = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
-        if len(distortion) < 8:
-            return up, np.asarray(d_up)
-        down = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        d_down = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6)
-        return up / down, (d_up * down - up * d_down) / (down * down)
-
-    def _distort(self, xy: Array, distortion: Array) -> Array:
-        x, y = xy[:, 0], xy[:, 1]
-        p1, p2 = distortion[2:4]
-        r2 = x * x + y * y
-        g, _ = self._radial(r2, distortion)
-        out = np.empty_like(xy)
-        out[:, 0] = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        out[:, 1] = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        return out
-
-    def _slope(self, xy: Array, distortion: Array) -> Array:
-        """Return the derivative of `_distort` by (x, y), (N, 2, 2); it is symmetric."""
+    def _slope(xy: Array, distortion: Array) -> Array:
+        """Return the derivative of the distortion by (x, y), (N, 2, 2); it is symmetric."""
         out = np.empty((len(xy), 2, 2))
         if len(distortion) == 0:
             out[:] = np.eye(2)
             return out
         x, y = xy[:, 0], xy[:, 1]
         p1, p2 = distortion[2:4]
-        g, dg = self._radial(x * x + y * y, distortion)
+        g, dg = _radial(x * x + y * y, distortion)
         out[:, 0, 0] = g + 2.0 * dg * x * x + 2.0 * p1 * y + 6.0 * p2 * x
         out[:, 0, 1] = out[:, 1, 0] = 2.0 * (dg * x * y + p1 * x + p2 * y)
         out[:, 1, 1] = g + 2.0 * dg * y * y + 6.0 * p1 * y + 2.0 * p2 * x
         return out
 
-    def _undistort(self, plane: Array, distortion: Array) -> Array:
-        """Solve distort(xy) = plane by Newton; a fixed-point step where the slope is bad."""
-        limit = self._fold(distortion)
-        xy = plane.copy()
-        for _ in range(30):
-            missing = plane - self._distort(xy, distortion)
-            if not np.nanmax(np.abs(missing), initial=0.0) > 1e-15 * 8:
-                break
-            slope = self._slope(xy, distortion)
-            a, b, d = slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 1]
-            det = a * d - b * b
-            good = det > 0.05
-            det = np.where(good, det, 1.0)
-            newton = np.stack(
-                [
-                    (d * missing[:, 0] - b * missing[:, 1]) / det,
-                    (a * missing[:, 1] - b * missing[:, 0]) / det,
-                ],
-                axis=1,
-            )
-            step = np.where(good[:, None], newton, 0.5 * missing)
-            length = np.sqrt(np.sum(step * step, axis=1, keepdims=True))
-            xy = xy + step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
-        wrong = np.max(np.abs(plane - self._distort(xy, distortion)), axis=1, initial=0.0)
-        solved = (wrong < 1e-10) & (np.sum(xy * xy, axis=1) < limit)
-        return np.where(solved[:, None], xy, np.nan)
 
-    @staticmethod
-    def _fold(distortion: Array) -> float:
-        """Return the r² at which r·g(r²) stops growing, infinity if it never does."""
-        k = np.pad(distortion, (0, 8 - len(distortion)))
-        up = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
-        down = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
-        # d/dr [r g(r²)] = 0, times down², as a polynomial in s = r².
-        s = np.polynomial.Polynomial([0.0, 1.0])
-        growth = up * down + 2.0 * s * (up.deriv() * down - up * down.deriv())
-        roots = np.concatenate([growth.trim().roots(), down.trim().roots()])
-        real = roots[np.abs(np.imag(roots)) < 1e-9].real
-        return float(np.min(real[real > 0], initial=np.inf))
+def _radial(r2: Array, distortion: Array) -> tuple[Array, Array]:
+    """Return g(r²) and its derivative by r²."""
+    k1, k2 = distortion[:2]
+    k3 = distortion[4] if len(distortion) > 4 else 0.0
+    up = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    d_up = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    if len(distortion) < 8:
+        return np.asarray(up), np.asarray(d_up)
+    k4, k5, k6 = distortion[5:]
+    down = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    d_down = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6)
+    return np.asarray(up / down), np.asarray((d_up * down - up * d_down) / (down * down))
 
 
 MODELS: Mapping[str, LensModel] = MappingProxyType({"pinhole": RadialTangential()})
@@ -260,6 +245,10 @@ class Camera:
         K.setflags(write=False)
         return K
 
+    @cached_property
+    def _reach(self) -> float:
+        return MODELS[self.model].reach(self.distortion)
+
     def project(self, points_camera: ArrayLike) -> Array:
         """Project points to pixels.
 
@@ -270,7 +259,7 @@ class Camera:
             (N, 2) pixels, NaN behind the camera or beyond what the lens model can see.
         """
         points = _rows(points_camera, 3, "points_camera")
-        plane = MODELS[self.model].to_plane(points, self.distortion)
+        plane = MODELS[self.model].to_plane(points, self.distortion, self._reach)
         return np.asarray(plane * self.intrinsics[:2] + self.intrinsics[2:])
 
     def project_jacobian(self, points_camera: ArrayLike) -> Array:
@@ -339,7 +328,7 @@ class Camera:
     def _rays(self, pixels: ArrayLike) -> Array:
         uv = _rows(pixels, 2, "pixels")
         plane = (uv - self.intrinsics[2:]) / self.intrinsics[:2]
-        return MODELS[self.model].from_plane(plane, self.distortion)
+        return MODELS[self.model].from_plane(plane, self.distortion, self._reach)
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
