@@ -1,0 +1,86 @@
+"""Edges: measured relative placements of two keyframes, what a pose graph is made of.
+
+An edge (i, j) says S_i_j = S_i⁻¹ S_j was measured as (T_i_j, scale_i_j) with an information matrix
+over the tangent (translation, rotation), right update. A measurement is never changed: an edge to a
+keyframe that was culled keeps its ids, and the stub says where that end is.
+
+Reference: R. Kümmerle et al., g2o: a general framework for graph optimization, 2011.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.maps.columns import grown
+
+__all__ = ["EdgeTable", "Edges"]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTable:
+    """Edges as arrays, a copy.
+
+    Attributes:
+        i: (E,) int64 keyframe ids.
+        j: (E,) int64 keyframe ids.
+        Ts_i_j: (E, 4, 4) measured poses of j in i, in the units of i.
+        scales_i_j: (E,) units of i per unit of j.
+        information: (E, 6, 6).
+        kind: (E,) what measured it, such as "odometry" or "loop".
+    """
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    Ts_i_j: NDArray[np.float64]
+    scales_i_j: NDArray[np.float64]
+    information: NDArray[np.float64]
+    kind: tuple[str, ...]
+
+
+class Edges:
+    """A growing table of edges; rows are numbered in the order they came."""
+
+    def __init__(self) -> None:
+        self._ends = np.zeros((0, 2), np.int64)
+        self._Ts = np.zeros((0, 4, 4))
+        self._scales = np.zeros(0)
+        self._information = np.zeros((0, 6, 6))
+        self._kind: list[str] = []
+
+    def __len__(self) -> int:
+        return len(self._kind)
+
+    def add(
+        self,
+        i: int,
+        j: int,
+        T_i_j: NDArray[np.float64],
+        information: NDArray[np.float64],
+        kind: str,
+        scale_i_j: float,
+    ) -> int:
+        """Append an edge and return its row."""
+        row = len(self._kind)
+        self._ends = grown(self._ends, row + 1)
+        self._Ts = grown(self._Ts, row + 1)
+        self._scales = grown(self._scales, row + 1)
+        self._information = grown(self._information, row + 1)
+        self._ends[row] = i, j
+        self._Ts[row] = T_i_j
+        self._scales[row] = scale_i_j
+        self._information[row] = information
+        self._kind.append(kind)
+        return row
+
+    def table(self) -> EdgeTable:
+        """Return all edges, copied."""
+        rows = len(self._kind)
+        return EdgeTable(
+            self._ends[:rows, 0].copy(),
+            self._ends[:rows, 1].copy(),
+            self._Ts[:rows].copy(),
+            self._scales[:rows].copy(),
+            self._information[:rows].copy(),
+            tuple(self._kind),
+        )

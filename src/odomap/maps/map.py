@@ -1,0 +1,144 @@
+"""The map: keyframes, where they are, the landmarks they see, and one lock around it all.
+
+The law is that everything hangs from keyframes: frames, landmarks and stubs are stored relative to
+one, in its units, so that correcting a path is one write of `states`. Several threads share a map;
+each method takes the lock for as long as it copies or writes arrays, never while something is
+solved. `version` grows with every change, `epoch` with every solution written (poses a caller
+remembers from an earlier epoch are stale then: place them anew from their keyframe).
+
+    snapshot(ids) → solve without the lock → apply(update)
+
+Methods are vectorised; they cost O(rows touched), not O(size of the map).
+
+Reference: R. Mur-Artal, J. Montiel, J. Tardós, ORB-SLAM: a versatile and accurate monocular SLAM
+system, 2015.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from odomap.maps import writing
+from odomap.maps.sightings import Sightings
+from odomap.maps.snapshot import Snapshot, Update
+from odomap.maps.states import act, act_inverse
+from odomap.maps.tree import ALIVE
+
+__all__ = ["Map"]
+
+
+class Map(Sightings):
+    """What is remembered of one connected part of the world.
+
+    Keyframes and their poses come from `Skeleton`, landmarks and observations from `Sightings`;
+    here are the operations on all of them: forgetting and solving.
+    """
+
+    def cull_keyframes(self, keyframe_ids: ArrayLike) -> None:
+        """Remove keyframes that add nothing, and keep placed what hangs from them.
+
+        Each leaves a stub below its parent; its landmarks are stored relative to the oldest
+        keyframe that still sees them, or else to the parent; its observations go. Those culled
+        already are passed over.
+
+        Args:
+            keyframe_ids: (n,) keyframes; one at least must remain in the map.
+        """
+        with self.lock:
+            ids = [k for k in self._ids(keyframe_ids).tolist() if self._known(k) in self._keyframes]
+            if ids and len(set(ids)) == len(self._keyframes):
+                raise ValueError("culling would leave no keyframe in the map")
+            for k in dict.fromkeys(ids):
+                self._drop_observations_of(np.array([k]))
+                slots = self._landmarks.anchored(np.array([k]))
+                placement = self._tree.placements(self.states, np.array([k]))
+                points = act(placement, self._landmarks.p_anchor[slots])
+                holder = self._tree.cull(self.states, k)
+                heirs = self._observations.first_keyframe(slots)
+                heirs[heirs < 0] = holder
+                p_anchor = act_inverse(self.states.placements(heirs), points)
+                self._landmarks.reanchor(slots, heirs, p_anchor)
+                del self._keyframes[k]
+                self._newest = holder if self._newest == k else self._newest
+            self.version += 1
+
+    def retire_keyframes(self, keyframe_ids: ArrayLike) -> None:
+        """Forget what keyframes saw, and keep where they are: for odometry, which never returns.
+
+        Payload and observations go, and landmarks that no keyframe sees any more.
+
+        Args:
+            keyframe_ids: (n,) keyframes; culled ones are passed over.
+        """
+        with self.lock:
+            ids = np.unique(self._ids(keyframe_ids))
+            ids = ids[self._tree.status[self._all_known(ids)] == ALIVE]
+            left = np.unique(np.r_[self._drop_observations_of(ids), self._landmarks.anchored(ids)])
+            self._landmarks.remove(left[self._observations.count(left) == 0])
+            for k in ids.tolist():
+                self._keyframes[k] = self._keyframes[k].without_payload()
+            self.version += 1
+
+    def snapshot(self, keyframe_ids: ArrayLike, fixed_ids: ArrayLike = ()) -> Snapshot:
+        """Copy a part of the map for a solver.
+
+        Args:
+            keyframe_ids: keyframes to solve for; those culled meanwhile are left out.
+            fixed_ids: keyframes that hold them in place; one in both lists is fixed.
+
+        Returns:
+            The keyframes in the order given, fixed ones last, with the landmarks that a free one
+            sees and all their observations in these keyframes.
+        """
+        with self.lock:
+            fixed = self._ids(fixed_ids)
+            free = self._ids(keyframe_ids)
+            wanted = dict.fromkeys(np.r_[free[~np.isin(free, fixed)], fixed].tolist())
+            kept = [k for k in wanted if self._known(k) in self._keyframes]
+            if not kept:
+                raise ValueError("a snapshot needs a keyframe that is in the map")
+            ids = np.asarray(kept, np.int64)
+            is_fixed = np.isin(ids, fixed)
+            indptr, rows = self._observations.of_keyframes(ids)
+            _, slots, keypoints = self._observations.columns(rows)
+            position = np.repeat(np.arange(len(ids)), np.diff(indptr))
+            seen = np.unique(slots[~is_fixed[position]])
+            index = self._observations.positions(slots, seen)
+            used = index >= 0
+            Ts, scales = self.states.placements(ids)
+            return Snapshot(
+                keyframes=tuple(self._keyframes[k] for k in kept),
+                keyframe_ids=ids,
+                is_fixed=is_fixed,
+                Ts_world_body=Ts,
+                scales=scales,
+                landmark_ids=self._landmarks.ids[seen],
+                points_world=self._points(seen),
+                obs_keyframe=position[used],
+                obs_landmark=index[used],
+                obs_keypoint=keypoints[used],
+                anchor_id=int(ids[is_fixed][0]) if is_fixed.any() else int(ids[0]),
+                version=self.version,
+                epoch=self.epoch,
+            )
+
+    def apply(self, update: Update) -> None:
+        """Write a solution into the map as it is now (rules: `odomap.maps.snapshot`).
+
+        Args:
+            update: what was solved, from `Snapshot.solved` or made by hand.
+        """
+        with self.lock:
+            self._all_known(np.r_[update.anchor_id, update.keyframe_ids])
+            C = writing.correction(self._tree, self.states, update)
+            writing.move_keyframes(self._tree, self.states, update, C)
+            writing.move_landmarks(self._landmarks, self.states, update, C)
+            writing.drop_observations(self._observations, self._landmarks, update)
+            self.version += 1
+            self.epoch += 1
+
+    def _drop_observations_of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Remove all observations of keyframes, and return the slots of what they saw."""
+        _, rows = self._observations.of_keyframes(keyframes)
+        slots = self._observations.columns(rows)[1]
+        self._observations.remove(rows)
+        return slots

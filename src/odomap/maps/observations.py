@@ -1,0 +1,179 @@
+"""Observations: which keyframe saw which landmark, at which of its keypoints.
+
+One table of rows (keyframe, landmark, keypoint), read both ways through CSR views:
+
+    rows of keyframe k: the landmarks it sees       rows of landmark l: the keyframes that see it
+
+A row keeps its number while it lives, and the pair (keyframe, landmark) is unique, so either names
+it. Both views are kept up to date as rows come and go (`Ragged`): an operation costs O(rows
+touched), however large the map. Covisibility is counted off the table, it is not stored:
+
+    covisibility(k, j) = #{l : (k, l) and (j, l) are rows}
+
+Landmarks are named by slot here (`Landmarks.slots`); `Map` speaks in ids.
+
+Reference: H. Strasdat et al., Double window optimisation for constant time visual SLAM, 2011.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.maps.columns import grown
+from odomap.maps.ragged import Ragged
+
+__all__ = ["Observations"]
+
+
+class Observations:
+    """The table (keyframe, landmark, keypoint)."""
+
+    def __init__(self) -> None:
+        self._keyframe = np.zeros(0, np.int32)
+        self._landmark = np.zeros(0, np.int32)
+        self._keypoint = np.zeros(0, np.int32)
+        self._alive = np.zeros(0, np.bool_)
+        self._mark = np.zeros(0, np.int32)
+        self._by_keyframe = Ragged()
+        self._by_landmark = Ragged()
+        self._free: list[int] = []
+        self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - len(self._free)
+
+    def columns(
+        self, rows: NDArray[np.int64] | NDArray[np.int32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Return the (N,) keyframes, landmark slots and keypoints of (N,) rows."""
+        return (
+            self._keyframe[rows].astype(np.int64),
+            self._landmark[rows].astype(np.int64),
+            self._keypoint[rows].astype(np.int64),
+        )
+
+    def rows(self) -> NDArray[np.int64]:
+        """Return all living rows in order."""
+        return np.flatnonzero(self._alive[: self._end])
+
+    def of_keyframes(
+        self, keyframes: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Return the CSR view (indptr, rows) of (N,) keyframes."""
+        return self._by_keyframe.gather(keyframes)
+
+    def of_landmarks(
+        self, landmarks: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Return the CSR view (indptr, rows) of (N,) landmark slots."""
+        return self._by_landmark.gather(landmarks)
+
+    def count(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many keyframes see each of (N,) landmark slots."""
+        return self._by_landmark.counts(landmarks)
+
+    def first_keyframe(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lowest keyframe that sees each of (N,) landmark slots, -1 where none does."""
+        indptr, rows = self.of_landmarks(landmarks)
+        first = np.full(len(landmarks), -1, np.int64)
+        seen = np.flatnonzero(np.diff(indptr) > 0)
+        if len(seen):
+            first[seen] = np.minimum.reduceat(self._keyframe[rows], indptr[seen])
+        return first
+
+    def find(self, keyframes: NDArray[np.int64], landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the (N,) rows of N pairs, -1 where there is none."""
+        indptr, rows = self.of_landmarks(landmarks)
+        pair = np.repeat(np.arange(len(landmarks)), np.diff(indptr))
+        hit = self._keyframe[rows] == keyframes[pair]
+        found = np.full(len(landmarks), -1, np.int64)
+        found[pair[hit]] = rows[hit]
+        return found
+
+    def covisible(self, keyframe: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Count what a keyframe sees together with others.
+
+        Returns:
+            ids and counts (n,) of the keyframes that share a landmark, most first, then oldest.
+        """
+        _, rows = self.of_keyframes(np.array([keyframe]))
+        _, others = self.of_landmarks(self._landmark[rows].astype(np.int64))
+        counts = np.bincount(self._keyframe[others]) if len(others) else np.zeros(0, np.int64)
+        counts[keyframe : keyframe + 1] = 0
+        ids = np.flatnonzero(counts)
+        order = np.argsort(-counts[ids], kind="stable")
+        return ids[order], counts[ids[order]]
+
+    def positions(self, landmarks: NDArray[np.int64], of: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return where each of (N,) slots stands in the (M,) distinct slots `of`, -1 if nowhere."""
+        highest = max(int(landmarks.max(initial=-1)), int(of.max(initial=-1)))
+        self._mark = grown(self._mark, highest + 1, fill=-1)
+        self._mark[of] = np.arange(len(of), dtype=np.int32)
+        where = self._mark[landmarks].astype(np.int64)
+        self._mark[of] = -1
+        return where
+
+    def add(self, keyframe: int, landmarks: NDArray[np.int64], keypoints: NDArray[np.int64]) -> int:
+        """Add the observations of one keyframe; a pair already there takes the new keypoint.
+
+        Args:
+            keyframe: its id.
+            landmarks: (N,) slots; of one that comes twice the last keypoint counts.
+            keypoints: (N,) indices into the keyframe's features, -1 where there is none.
+
+        Returns:
+            How many rows were added.
+        """
+        last = np.zeros(len(landmarks), np.bool_)
+        last[len(landmarks) - 1 - np.unique(landmarks[::-1], return_index=True)[1]] = True
+        landmarks, keypoints = landmarks[last], keypoints[last]
+        known = self.find(np.full(len(landmarks), keyframe), landmarks)
+        old = known >= 0
+        self._keypoint[known[old]] = keypoints[old]
+        landmarks, keypoints = landmarks[~old], keypoints[~old]
+        rows = self._new_rows(len(landmarks))
+        self._keyframe[rows] = keyframe
+        self._landmark[rows] = landmarks
+        self._keypoint[rows] = keypoints
+        self._alive[rows] = True
+        self._by_keyframe.append(np.full(len(rows), keyframe), rows.astype(np.int32))
+        self._by_landmark.append(landmarks, rows.astype(np.int32))
+        return len(rows)
+
+    def remove(self, rows: NDArray[np.int64] | NDArray[np.int32]) -> None:
+        """Remove (N,) living rows."""
+        gone = np.unique(rows)
+        self._alive[gone] = False
+        self._by_keyframe.keep(np.unique(self._keyframe[gone]).astype(np.int64), self._alive)
+        self._by_landmark.keep(np.unique(self._landmark[gone]).astype(np.int64), self._alive)
+        self._free.extend(gone.tolist())
+
+    def reassign(self, gone: NDArray[np.int64], survivors: NDArray[np.int64]) -> None:
+        """Hand the rows of N distinct landmarks to N survivors (none of them among the gone).
+
+        Where a keyframe sees both, the row the survivor had stays.
+        """
+        indptr, rows = self.of_landmarks(gone)
+        heirs = np.repeat(survivors, np.diff(indptr))
+        keyframes = self._keyframe[rows].astype(np.int64)
+        key = keyframes << 32 | heirs
+        moves = np.zeros(len(rows), np.bool_)
+        moves[np.unique(key, return_index=True)[1]] = True
+        moves &= self.find(keyframes, heirs) < 0
+        self.remove(rows[~moves])
+        rows, heirs = rows[moves], heirs[moves]
+        self._by_landmark.clear(gone)
+        self._landmark[rows] = heirs
+        self._by_landmark.append(heirs, rows)
+
+    def _new_rows(self, number: int) -> NDArray[np.int64]:
+        cut = max(len(self._free) - number, 0)
+        reused = self._free[cut:]
+        del self._free[cut:]
+        fresh = self._end + np.arange(number - len(reused), dtype=np.int64)
+        self._end += len(fresh)
+        self._keyframe = grown(self._keyframe, self._end)
+        self._landmark = grown(self._landmark, self._end)
+        self._keypoint = grown(self._keypoint, self._end)
+        self._alive = grown(self._alive, self._end)
+        rows: NDArray[np.int64] = np.r_[np.asarray(reused, np.int64), fresh]
+        return rows

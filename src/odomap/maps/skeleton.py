@@ -1,0 +1,220 @@
+"""The skeleton of a map: keyframes, where they are, and how they hang together.
+
+Frames are placed against keyframes, keyframes against each other: a spanning tree with the poses
+beside it, and the measured edges between keyframes. Poses are read here for living keyframes and
+for culled ones alike, so that a frame which hangs from a keyframe stays placed,
+
+    T_world_frame = S_keyframe T_keyframe_frame,
+
+whatever became of the keyframe. Every method takes the lock and costs O(ids asked for).
+
+Reference: K. Konolige, J. Bowman, Towards lifelong visual maps, 2009 (views as a skeleton).
+"""
+
+import threading
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from odomap.maps.edges import Edges, EdgeTable
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.states import States, compose
+from odomap.maps.tree import ABSENT, ALIVE, STUB, Tree
+
+__all__ = ["Skeleton"]
+
+
+class Skeleton:
+    """Keyframes, states, spanning tree and edges under one lock; `Map` adds what they see.
+
+    Attributes:
+        lock: re-entrant; hold it to make several calls as one.
+        states: poses, scales, velocities, biases and covariances by keyframe id. Touch it only
+            while holding the lock.
+        version: grows with every change.
+        epoch: grows with every solution written.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.states = States()
+        self.version = 0
+        self.epoch = 0
+        self._tree = Tree()
+        self._keyframes: dict[int, Keyframe] = {}
+        self._edges = Edges()
+        self._next_keyframe = 0
+        self._newest = -1
+
+    @property
+    def num_keyframes(self) -> int:
+        """How many living keyframes there are."""
+        return len(self._keyframes)
+
+    def new_keyframe_id(self) -> int:
+        """Reserve the id of a keyframe to be added."""
+        with self.lock:
+            self._next_keyframe += 1
+            return self._next_keyframe - 1
+
+    def add_keyframe(
+        self,
+        keyframe: Keyframe,
+        T_world_body: NDArray[np.float64],
+        *,
+        parent: int = -1,
+        covariance: NDArray[np.float64] | None = None,
+        v_world_body: NDArray[np.float64] | None = None,
+        scale: float | None = None,
+    ) -> None:
+        """Add a keyframe.
+
+        Args:
+            keyframe: with an id from `new_keyframe_id`.
+            T_world_body: (4, 4) where it is.
+            parent: id of the keyframe it was placed against; by default the newest one.
+            covariance: (6, 6) of T_world_body, right tangent; unknown (NaN) by default.
+            v_world_body: (3,) velocity, m/s; unknown (NaN) by default.
+            scale: world units per unit of the keyframe; by default those of its parent.
+        """
+        with self.lock:
+            k = keyframe.id
+            if k < 0 or self._tree.status_of(k) != ABSENT:
+                raise ValueError(f"keyframe {k}: the id is taken, use new_keyframe_id()")
+            if np.shape(T_world_body) != (4, 4) or not np.isfinite(T_world_body).all():
+                raise ValueError(f"keyframe {k}: T_world_body must be a finite (4, 4) array")
+            holder = (
+                self._living(self._newest if parent < 0 else parent) if len(self._keyframes) else -1
+            )
+            self.version += 1
+            self._tree.add(k, holder, self.version)
+            self.states.extend(k + 1)
+            self.states.Ts_world_body[k] = T_world_body
+            inherited = 1.0 if holder < 0 else self.states.scales[holder]
+            self.states.scales[k] = inherited if scale is None else scale
+            self.states.v_world_body[k] = np.nan if v_world_body is None else v_world_body
+            self.states.covariances[k] = np.nan if covariance is None else covariance
+            self._keyframes[k] = keyframe
+            self._next_keyframe = max(self._next_keyframe, k + 1)
+            self._newest = k
+
+    def keyframe(self, keyframe_id: int) -> Keyframe:
+        """Return a living keyframe; one that was retired has no payload any more."""
+        with self.lock:
+            if keyframe_id not in self._keyframes:
+                raise KeyError(f"keyframe {keyframe_id} is not in the map (culled?)")
+            return self._keyframes[keyframe_id]
+
+    @property
+    def keyframe_ids(self) -> NDArray[np.int64]:
+        """(K,) ids of living keyframes in order."""
+        with self.lock:
+            return self._tree.alive()
+
+    def is_keyframe_alive(self, keyframe_id: int) -> bool:
+        """Return whether a keyframe is in the map and not culled."""
+        with self.lock:
+            return self._tree.status_of(keyframe_id) == ALIVE
+
+    def parent(self, keyframe_id: int) -> int:
+        """Return the living parent of a keyframe or stub in the spanning tree, -1 for the root."""
+        with self.lock:
+            return int(self._tree.parent[self._known(keyframe_id)])
+
+    def T_world_body(self, keyframe_id: int) -> NDArray[np.float64]:
+        """Return the (4, 4) pose of a keyframe, also of a culled one."""
+        return np.asarray(self.Ts_world_body(np.array([keyframe_id]))[0])
+
+    def Ts_world_body(self, keyframe_ids: ArrayLike) -> NDArray[np.float64]:
+        """Return the (n, 4, 4) poses of keyframes, also of culled ones."""
+        with self.lock:
+            return self._tree.placements(self.states, self._all_known(keyframe_ids))[0]
+
+    def scale(self, keyframe_id: int) -> float:
+        """Return the world units per unit of a keyframe, also of a culled one."""
+        with self.lock:
+            return float(self._tree.placements(self.states, self._all_known([keyframe_id]))[1][0])
+
+    def place(self, keyframe_id: int, T_keyframe_body: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pose of a frame that hangs from a keyframe, also from a culled one.
+
+        Args:
+            keyframe_id: the keyframe.
+            T_keyframe_body: (4, 4) or (n, 4, 4) relative pose, in the keyframe's units.
+
+        Returns:
+            T_world_body, of the same shape.
+        """
+        with self.lock:
+            Ts, scales = self._tree.placements(self.states, self._all_known([keyframe_id]))
+        return compose((Ts[0], scales[0]), (np.asarray(T_keyframe_body), np.ones(())))[0]
+
+    def covariance(self, keyframe_id: int) -> NDArray[np.float64]:
+        """Return the (6, 6) covariance of a keyframe's pose, right tangent; NaN where unknown."""
+        with self.lock:
+            return np.array(self.states.covariances[self._known(keyframe_id)])
+
+    def set_covariance(self, keyframe_ids: ArrayLike, covariances: NDArray[np.float64]) -> None:
+        """Write the (n, 6, 6) covariances, or one (6, 6), of keyframes."""
+        with self.lock:
+            self.states.covariances[self._all_known(keyframe_ids)] = covariances
+            self.version += 1
+
+    def add_edge(
+        self,
+        i: int,
+        j: int,
+        T_i_j: NDArray[np.float64],
+        information: NDArray[np.float64],
+        kind: str,
+        *,
+        scale_i_j: float = 1.0,
+    ) -> int:
+        """Keep a measured relative pose of two keyframes.
+
+        Args:
+            i: keyframe measured from.
+            j: keyframe measured.
+            T_i_j: (4, 4) pose of j in i, in the units of i.
+            information: (6, 6), tangent (translation, rotation), right update.
+            kind: what measured it, such as "odometry" or "loop".
+            scale_i_j: units of i per unit of j.
+
+        Returns:
+            The row of the edge.
+        """
+        with self.lock:
+            self.version += 1
+            ends = self._known(i), self._known(j)
+            return self._edges.add(*ends, T_i_j, information, kind, scale_i_j)
+
+    def edges(self) -> EdgeTable:
+        """Return all edges, copied."""
+        with self.lock:
+            return self._edges.table()
+
+    @staticmethod
+    def _ids(ids: ArrayLike) -> NDArray[np.int64]:
+        array = np.asarray(ids)
+        if array.size and array.dtype.kind not in "iu":
+            raise TypeError(f"ids must be integers, not {array.dtype}")
+        return np.atleast_1d(array).astype(np.int64, copy=False)
+
+    def _known(self, keyframe_id: int) -> int:
+        if self._tree.status_of(keyframe_id) == ABSENT:
+            raise KeyError(f"keyframe {keyframe_id} was never in the map")
+        return keyframe_id
+
+    def _all_known(self, keyframe_ids: ArrayLike) -> NDArray[np.int64]:
+        ids = self._ids(keyframe_ids)
+        inside = (ids >= 0) & (ids < len(self._tree.status))
+        if not inside.all() or (self._tree.status[ids] == ABSENT).any():
+            for k in ids.tolist():
+                self._known(k)
+        return ids
+
+    def _living(self, keyframe_id: int) -> int:
+        """Return a keyframe, or the one that holds its stub."""
+        if self._tree.status_of(self._known(keyframe_id)) == STUB:
+            return int(self._tree.parent[keyframe_id])
+        return keyframe_id
