@@ -1,6 +1,18 @@
-"""Frames: what the sensors said at one instant, never changed afterwards."""
+"""Frames: what the sensors said at one instant, never changed afterwards.
 
-from collections.abc import Iterator
+A frame carries raw measurements only. Cameras of one frame are taken to be exposed together; the
+inertial samples belong to the interval that the frame closes,
+
+    stamp(previous frame) < stamps_ns <= stamp(this frame),
+
+so that the samples of consecutive frames, put one after the other, are the whole stream: what
+preintegration needs, and what stays true when a frame between is left out.
+
+Reference: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
+IEEE Trans. Robotics 33(1), 2017.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,8 +36,42 @@ class ImuSamples:
     gyro: NDArray[np.float64]
     accel: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        count = len(self.stamps_ns)
+        if self.gyro.shape != (count, 3) or self.accel.shape != (count, 3):
+            raise ValueError(
+                f"{count} stamps need gyro and accel of shape ({count}, 3), "
+                f"got {self.gyro.shape} and {self.accel.shape}"
+            )
+        if np.any(self.stamps_ns[1:] <= self.stamps_ns[:-1]):
+            raise ValueError("stamps of inertial samples must increase strictly")
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def between(self, after_ns: int | None, until_ns: int) -> "ImuSamples":
+        """Return the samples after one stamp, up to and including another (views, no copies).
+
+        Args:
+            after_ns: excluded lower end, None for the beginning.
+            until_ns: included upper end.
+        """
+        start = 0
+        if after_ns is not None:
+            start = int(np.searchsorted(self.stamps_ns, after_ns, side="right"))
+        stop = max(start, int(np.searchsorted(self.stamps_ns, until_ns, side="right")))
+        return ImuSamples(self.stamps_ns[start:stop], self.gyro[start:stop], self.accel[start:stop])
+
+    @staticmethod
+    def joined(parts: "Sequence[ImuSamples]") -> "ImuSamples":
+        """Put consecutive pieces of one stream together."""
+        if not parts:
+            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        return ImuSamples(
+            np.concatenate([part.stamps_ns for part in parts]),
+            np.concatenate([part.gyro for part in parts]),
+            np.concatenate([part.accel for part in parts]),
+        )
 
 
 @dataclass(frozen=True)
@@ -59,3 +105,5 @@ class Frame:
         """Yield the arrays of this frame (for counting bytes, or freezing them)."""
         yield from (image for image in self.images if image is not None)
         yield from (a for a in (self.depth, self.scan, self.cloud) if a is not None)
+        if self.imu is not None:
+            yield from (self.imu.stamps_ns, self.imu.gyro, self.imu.accel)

@@ -1,14 +1,23 @@
-"""Sources: where frames come from. Every reader, simulator and wrapper has this face."""
+"""Sources: where frames come from. Every reader, simulator and wrapper has this face.
+
+A source is a stream: iterating it reads one frame after the other and keeps none, so memory does
+not grow with the recording. A source that can also give frame i by itself is a `RandomAccess`;
+playing backwards needs that.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 
-__all__ = ["Skipped", "Source"]
+__all__ = ["RandomAccess", "Skipped", "Source", "UnusableFrame"]
 
 
 @dataclass(frozen=True)
@@ -20,6 +29,14 @@ class Skipped:
     reason: str
 
 
+class UnusableFrame(InputError):
+    """A single frame cannot be read; iteration notes it in `skipped` and goes on."""
+
+    def __init__(self, skipped: Skipped) -> None:
+        super().__init__(f"{skipped.file}: {skipped.reason}")
+        self.skipped = skipped
+
+
 @runtime_checkable
 class Source(Protocol):
     """A stream of frames in order of time.
@@ -29,6 +46,9 @@ class Source(Protocol):
         rig: what is mounted where.
         truth: ground truth of T_world_body, or None.
         skipped: what the iteration so far had to leave out; a fresh iteration starts it anew.
+
+    Sources made from files also have `notes: list[str]`: what was found odd on opening and how it
+    was mended, one sentence each, for the user.
     """
 
     name: str
@@ -42,4 +62,29 @@ class Source(Protocol):
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; starts from the beginning each time."""
+        ...
+
+
+@runtime_checkable
+class RandomAccess(Source, Protocol):
+    """A source whose frames can be read in any order.
+
+    Attributes:
+        stamps_ns: (len,) int64, strictly increasing: the stamps of all frames, known unread.
+    """
+
+    stamps_ns: NDArray[np.int64]
+
+    def frame(self, index: int) -> Frame:
+        """Read one frame.
+
+        Args:
+            index: from 0 to len - 1.
+
+        Returns:
+            The frame; its inertial samples are those since the frame before it.
+
+        Raises:
+            UnusableFrame: it cannot be read.
+        """
         ...

@@ -1,0 +1,104 @@
+"""Opening a recording by guessing what it is.
+
+Recognised by what a folder holds, not by its name:
+
+    EuRoC ASL         mav0/cam0/data.csv (or the inside of mav0)
+    KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
+    simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
+
+A path that leads nowhere is answered with what stands nearest to it.
+"""
+
+from pathlib import Path
+
+from odomap.errors import InputError, nearest_name
+from odomap.files.rig import read_rig
+from odomap.sensors.rig import Rig
+from odomap.sources.euroc import EurocSource, is_euroc
+from odomap.sources.kitti import KittiSource, is_kitti
+from odomap.sources.source import Source
+
+__all__ = ["SUPPORTED", "open"]
+
+SUPPORTED = (
+    "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
+    "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
+)
+
+
+def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
+    """Open a recording or a simulated world; the format is recognised.
+
+    Args:
+        path: a folder, a `world.yaml`, or a name that begins with "sim:".
+        rig: calibration to use instead of the recording's own: a rig, or a `rig.yaml`. Without
+            it, a `rig.yaml` in the folder is used where the recording has no calibration.
+
+    Returns:
+        A source; iterate it for frames.
+
+    Raises:
+        InputError: there is nothing there, or nothing that is recognised.
+        CalibrationError: the calibration is incomplete or cannot be true.
+
+    Example:
+        >>> source = open("sim:room?seed=3&frames=2")  # doctest: +SKIP
+    """
+    if isinstance(path, str) and path.startswith("sim:"):
+        return _simulated(path, rig)
+    root = Path(path)
+    if not root.exists():
+        raise InputError(_missing(root))
+    if root.is_file():
+        if root.suffix.lower() in (".yaml", ".yml"):
+            return _simulated(str(root), rig)
+        raise InputError(f"{root}: files of this kind cannot be opened; supported are {SUPPORTED}")
+    if (root / "world.yaml").exists():
+        return _simulated(str(root / "world.yaml"), rig)
+    for recognises, reader in ((is_euroc, EurocSource), (is_kitti, KittiSource)):
+        if recognises(root):
+            return reader(root, _rig(root, rig))
+    raise InputError(_unrecognised(root))
+
+
+def _rig(root: Path, rig: Rig | str | Path | None) -> Rig | None:
+    if isinstance(rig, Rig):
+        return rig
+    if rig is not None:
+        return read_rig(rig)
+    inside = root / "rig.yaml"
+    calibrated = any(
+        (root / name).exists()
+        for name in ("calib.txt", "mav0/cam0/sensor.yaml", "cam0/sensor.yaml")
+    )
+    return read_rig(inside) if inside.exists() and not calibrated else None
+
+
+def _simulated(spec: str, rig: Rig | str | Path | None) -> Source:
+    if rig is not None:
+        raise InputError(f"{spec}: a simulated world has its own rig; leave --rig out")
+    from odomap.sources.simulated import SimulatedSource
+
+    source: Source = SimulatedSource(spec)
+    return source
+
+
+def _missing(root: Path) -> str:
+    parent = next((p for p in root.parents if p.exists()), Path("."))
+    name = root.relative_to(parent).parts[0] if root != parent else root.name
+    siblings = [entry.name for entry in parent.iterdir()] if parent.is_dir() else []
+    return f"{root}: does not exist{nearest_name(name, siblings)}"
+
+
+def _unrecognised(root: Path) -> str:
+    entries = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
+    if not entries:
+        return f"{root}: the folder is empty; supported are {SUPPORTED}"
+    for inside in sorted(p for p in (*root.glob("*/"), *root.glob("*/*/")) if p.is_dir()):
+        if is_euroc(inside) or is_kitti(inside):
+            return f"{root}: is not a recording itself, but holds one: open {inside}"
+    for outside in list(root.resolve().parents)[:3]:
+        if is_euroc(outside) or is_kitti(outside):
+            return f"{root}: is a part of a recording: open {outside}"
+    found = ", ".join(entries[:5]) + (", ..." if len(entries) > 5 else "")
+    return f"{root}: not recognised (it holds {found}); supported are {SUPPORTED}"
