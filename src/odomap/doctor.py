@@ -99,7 +99,7 @@ def total_memory_gb() -> float:
 
 
 def examine_core() -> Iterator[Finding]:
-    """Yield a finding per library that odomap needs: its version, and whether it can be imported."""
+    """Yield a finding per library that odomap needs: its version, and whether it imports."""
     for distribution, module in CORE.items():
         release = installed(distribution)
         try:

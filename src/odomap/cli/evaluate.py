@@ -1,0 +1,122 @@
+"""`odomap eval`: how far an estimated path is from the true one."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from odomap.evaluation.table import Scored, Table
+    from odomap.geometry.trajectory import Trajectory
+
+__all__ = ["Evaluate"]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a trajectory with a reference: ATE, RPE, KITTI segments, relations.
+
+    Trajectories are TUM text (time tx ty tz qx qy qz qw), KITTI rows or EuRoC csv, plain or .gz.
+    """
+
+    estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
+    """The trajectory to judge."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
+    """Ground truth: a trajectory, a recording that has one, or Freiburg *.relations."""
+    align: Literal["se3", "sim3", "yaw", "first", "none"] = "se3"
+    """How to align: rigid, with scale, about the vertical, first pose on first, or not at all."""
+    delta: float = 1.0
+    """Length of the increments of the relative error."""
+    unit: Literal["s", "m", "f"] = "s"
+    """Unit of delta: seconds, metres or frames."""
+    max_dt: float = 0.02
+    """Largest difference in time of two poses compared, seconds."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for eval.json and the plots."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def execute(self) -> int:
+        """Print the table, write what was asked for."""
+        from odomap.files.trajectories import read_trajectory
+
+        estimate = read_trajectory(self.estimate)
+        if ".relations" in self.reference.suffixes:
+            table = self._relations(estimate)
+            reference = None
+        else:
+            reference = read_reference(self.reference)
+            table = self._metrics(estimate, reference)
+        if self.json:
+            print(table.to_json())
+        else:
+            print(table.to_text())
+        if self.out is not None:
+            self._write(table, estimate, reference)
+        return 0
+
+    def _relations(self, estimate: "Trajectory") -> "Table":
+        from odomap.evaluation.relations import read_relations, relations
+        from odomap.evaluation.table import Table
+
+        result = relations(estimate, read_relations(self.reference))
+        return Table.of({self.estimate.name: {"relations": result}})
+
+    def _metrics(self, estimate: "Trajectory", reference: "Trajectory") -> "Table":
+        from odomap.errors import InputError
+        from odomap.evaluation.metrics import ate, kitti_segments, rpe
+        from odomap.evaluation.table import Table
+
+        groups: dict[str, Scored] = {"ATE": ate(estimate, reference, self.align, self.max_dt)}
+        scaled: Literal["se3", "sim3"] = "sim3" if self.align == "sim3" else "se3"
+        step = f"RPE {self.delta:g} {self.unit}"
+        try:
+            groups[step] = rpe(estimate, reference, self.delta, self.unit, scaled, self.max_dt)
+        except InputError as error:
+            print(f"odomap: no {step}: {error}", file=sys.stderr)
+        # Drift over 100 m and more says nothing about shorter paths: left out there, not an error.
+        if reference.path_length >= 100.0:
+            try:
+                groups["KITTI"] = kitti_segments(estimate, reference, self.max_dt)
+            except InputError as error:
+                print(f"odomap: no KITTI segments: {error}", file=sys.stderr)
+        return Table.of({self.estimate.name: groups})
+
+    def _write(
+        self, table: "Table", estimate: "Trajectory", reference: "Trajectory | None"
+    ) -> None:
+        """Write eval.json, and what a person wants to see of two paths."""
+        from odomap.files.atomic import make_folder, write_bytes, write_text
+        from odomap.views.plots import error_figure, path_3d_figure, path_figure
+        from odomap.views.style import figure_png
+
+        assert self.out is not None
+        folder = make_folder(self.out)
+        written = [folder / "eval.json"]
+        write_text(written[0], table.to_json() + "\n")
+        if reference is not None:
+            for name, draw in (
+                ("path", path_figure),
+                ("path_3d", path_3d_figure),
+                ("error", error_figure),
+            ):
+                written.append(folder / f"{name}.png")
+                write_bytes(written[-1], figure_png(draw(estimate, reference)))
+        for path in written:
+            print(f"odomap: wrote {path}", file=sys.stderr)
+
+
+def read_reference(path: Path) -> "Trajectory":
+    """Read ground truth: a file, or that of a recording."""
+    from odomap.errors import InputError
+    from odomap.files.trajectories import read_trajectory
+    from odomap.sources.open import open as open_source
+
+    if not path.is_dir():
+        return read_trajectory(path)
+    truth = open_source(path).truth
+    if truth is None:
+        raise InputError(f"{path}: this recording has no ground truth")
+    return truth

@@ -1,0 +1,127 @@
+"""`odomap run`: from a recording to its path, map, numbers and report."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from odomap.cli.progress import TrackingProgress
+
+if TYPE_CHECKING:
+    from odomap.run import RunResult
+    from odomap.system.config import Config
+
+__all__ = ["Run", "conclude", "track"]
+
+Overrides = Annotated[tuple[tuple[str, str], ...], tyro.conf.Suppress]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Track a recording; write its path, map, numbers and a report.
+
+    Writes trajectory.tum, trajectory_live.tum, metrics.json, config.yaml and report.html. Any field
+    that `odomap config` prints can be set as --section.field VALUE.
+    """
+
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
+    """A recording (EuRoC ASL, KITTI odometry), a world.yaml, or 'sim:room?seed=3&frames=100'."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for the outputs; default runs/NAME."""
+    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """A preset; `odomap config --list` names them."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A config file, read over the preset."""
+    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A rig.yaml: which sensors there are and where they are mounted."""
+    rhythm: Literal["inline"] = "inline"
+    """How stages follow each other: inline, each in turn."""
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Stop after this many frames."""
+    quiet: bool = False
+    """No progress."""
+    overrides: Overrides = ()
+
+    def execute(self) -> int:
+        """Track, write, and say where everything is."""
+        from odomap.run import chosen_config
+        from odomap.sources.open import open as open_source
+
+        config = chosen_config(self.preset, self.config, self.overrides)
+        source = open_source(self.data, self.rig)
+        out = self.out or Path("runs") / folder_name(source.name)
+        command: dict[str, object] = {"data": self.data}
+        if self.preset:
+            command["preset"] = self.preset
+        return track(source, out, config, command, self.max_frames, self.quiet)[0]
+
+
+def folder_name(name: str) -> str:
+    """Return a source's name as the name of a folder."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip("._") or "run"
+
+
+def track(
+    source: object,
+    out: Path,
+    config: "Config",
+    origin: dict[str, object],
+    max_frames: int | None,
+    quiet: bool,
+) -> "tuple[int, RunResult]":
+    """Run with progress, print the conclusion, and return the exit code with the result."""
+    from odomap.run import Interrupted, run
+
+    code = 0
+    try:
+        with TrackingProgress(quiet) as progress:
+            result = run(
+                source,  # type: ignore[arg-type]
+                out,
+                config=config,
+                max_frames=max_frames,
+                progress=progress.show,
+                origin=origin,
+            )
+    except Interrupted as stop:
+        result, code = stop.result, 130
+        print(f"odomap: interrupted after {result.metrics['frames']} frames", file=sys.stderr)
+    conclude(result)
+    if code == 0 and result.failure:
+        print(f"odomap: {result.failure}", file=sys.stderr)
+        code = 1
+    return code, result
+
+
+def conclude(result: "RunResult") -> None:
+    """Print the numbers that matter and where the rest is."""
+    for warning in result.warnings:
+        print(f"odomap: warning: {warning}", file=sys.stderr)
+    for name, value in rows(result):
+        print(f"{name:<16} {value}")
+    if result.out is not None:
+        print(f"{'outputs':<16} {result.out}")
+        for name in result.written:
+            print(f"{'':<16} {result.out / name}")
+
+
+def rows(result: "RunResult") -> list[tuple[str, str]]:
+    """Return the lines of the conclusion, name and value."""
+    m = result.metrics
+    ms = m["ms_per_frame"]
+    counts = [f"{m['tracked']} tracked", f"{m['lost']} lost"]
+    if m["skipped"]:
+        counts.append(f"{m['skipped']} skipped")
+    lines = [("frames", f"{m['frames']}: {', '.join(counts)}")]
+    if m["frames"]:
+        rate = f"{m['real_time_factor']:.2f} x real time" if m["real_time_factor"] else ""
+        lines.append(("ms per frame", f"{ms['median']:.1f} median, {ms['p95']:.1f} p95  {rate}"))
+        lines.append(("map", f"{m['keyframes']} keyframes, {m['landmarks']} landmarks"))
+        lines.append(("path", f"{m['path_m']:.3f} m in {m['duration_s']:.2f} s"))
+    if m.get("ate_rmse_m") is not None:
+        share = f" ({m['ate']['rmse_pct_of_path']:.2f} % of the path)" if m["ate"] else ""
+        lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}"))
+    lines.append(("peak memory", f"{m['peak_memory_mb']:.0f} MB"))
+    return lines

@@ -1,0 +1,224 @@
+"""What a run leaves in its folder, and what of it survives a disk that fills up.
+
+The folder is made and tried before tracking. Live poses are appended as they come; everything else
+is written at the end, each file whole or not at all, the path first because it matters most. If
+one file cannot be written the others still are, and then one error says which are missing and
+which are there.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from odomap.errors import OutputError
+from odomap.files.atomic import make_folder, write_text
+from odomap.files.trajectories import write_tum
+from odomap.logbook import Logbook
+from odomap.maps.estimate import Estimate, Status
+from odomap.sensors.sync import format_stamp
+from odomap.settings import config_to_yaml
+from odomap.version import __version__
+
+if TYPE_CHECKING:
+    from odomap.sources.source import Source
+    from odomap.system.config import Config
+    from odomap.system.odometry import Result
+    from odomap.views.record import Report
+
+__all__ = ["Outputs"]
+
+REPORTED = (
+    "frames",
+    "tracked",
+    "lost",
+    "skipped",
+    "ms_per_frame",
+    "real_time_factor",
+    "duration_s",
+    "path_m",
+    "keyframes",
+    "landmarks",
+    "loops",
+    "cpu_s",
+    "compile_s",
+    "peak_memory_mb",
+)
+"""Metrics that the report shows."""
+
+FLUSH_EVERY = 25
+"""Frames after which the live path is handed to the operating system."""
+
+
+class Outputs:
+    """The output folder of one run.
+
+    Args:
+        folder: where to; made if it does not exist.
+        config: what the run is configured with.
+        head: keys for the head of config.yaml, such as the source.
+
+    Attributes:
+        folder: where to.
+        written: names of the files written so far.
+
+    Raises:
+        OutputError: the folder cannot be made or written to.
+    """
+
+    def __init__(self, folder: str | Path, config: "Config", head: Mapping[str, object]) -> None:
+        self.folder = make_folder(folder)
+        self.written: tuple[str, ...] = ()
+        self._config = config_to_yaml(config, {"odomap": __version__} | dict(head))
+        self._data = str(head.get("data", ""))
+        self._part = self.folder / "trajectory_live.tum.part"
+        self._live: TextIO | None = None
+        self._lines = 0
+
+    def append(self, estimate: Estimate) -> None:
+        """Append a live pose; lost frames have no row."""
+        if estimate.status == Status.LOST:
+            return
+        try:
+            if self._live is None:
+                self._live = self._part.open("w", encoding="ascii", newline="\n")
+            self._live.write(_row(estimate))
+            self._lines += 1
+            if self._lines % FLUSH_EVERY == 0:
+                self._live.flush()
+        except OSError:
+            # A full disk does not stop tracking: the path is in memory, and the files written at
+            # the end say what is wrong. Until then there may be space again.
+            self._forget_live()
+
+    def write(
+        self,
+        source: "Source",
+        result: "Result",
+        logbook: Logbook,
+        metrics: dict[str, Any],
+        warnings: list[str],
+    ) -> None:
+        """Write every output, whatever happens to the others.
+
+        Raises:
+            OutputError: at least one could not be written; the message says which there are.
+        """
+        self._close_live()
+        failures: list[OutputError] = []
+        report = self._report(source, result, logbook, metrics)
+        jobs: list[tuple[str, Callable[[], object]]] = [
+            ("trajectory.tum", lambda: write_tum(self._at("trajectory.tum"), result.trajectory)),
+            (
+                "trajectory_live.tum",
+                lambda: write_tum(self._at("trajectory_live.tum"), result.trajectory_live),
+            ),
+            ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
+            ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
+            ("report.html", lambda: self._write_report(report)),
+        ]
+        for name, job in jobs:
+            try:
+                job()
+            except OutputError as error:
+                failures.append(error)
+            else:
+                self.written += (name,)
+                if name == "trajectory_live.tum":
+                    self._part.unlink(missing_ok=True)
+        if failures:
+            there = f"written: {', '.join(self.written)}" if self.written else "nothing is written"
+            raise OutputError(f"{failures[0]}; {there}")
+
+    def _at(self, name: str) -> Path:
+        return self.folder / name
+
+    def _report(
+        self, source: "Source", result: "Result", logbook: Logbook, metrics: dict[str, Any]
+    ) -> "Report":
+        """Gather what the report shows."""
+        from odomap.views.record import Report, Sample
+
+        return Report(
+            title=source.name,
+            source=self._data,
+            version=__version__,
+            command=f"odomap run {self._data} --config {self.folder / 'config.yaml'}",
+            config=self._config,
+            rig=rig_text(source),
+            estimates=logbook.estimates,
+            trajectory=result.trajectory,
+            truth=source.truth,
+            scores={"ATE": metrics["ate"]} if metrics["ate"] else {},
+            metrics={name: metrics[name] for name in REPORTED},
+            samples=[
+                Sample(frame.images[0], estimate)
+                for frame, estimate in logbook.samples
+                if frame.images and frame.images[0] is not None
+            ],
+            skipped=[(item.stamp_ns, item.file, item.reason) for item in source.skipped],
+            points=result.map.points_world(result.map.landmark_ids),
+        )
+
+    def _write_report(self, report: "Report") -> None:
+        from odomap.views.report import write_report
+
+        try:
+            write_report(self.folder, report)
+        except OSError as error:
+            mend = f"{error.strerror or error}: choose another folder with --out"
+            raise OutputError(f"{self._at('report.html')}: cannot be written: {mend}") from error
+
+    def _close_live(self) -> None:
+        if self._live is not None:
+            try:
+                self._live.close()
+            except OSError:
+                self._forget_live()
+
+    def _forget_live(self) -> None:
+        """Give up the appended path, and the space it took."""
+        self._live = None
+        try:
+            self._part.unlink(missing_ok=True)
+        except OSError:
+            return  # nothing more can be done with it, and the final path does not need it
+
+
+def _row(estimate: Estimate) -> str:
+    x, y, z = estimate.T_world_body.t
+    qw, qx, qy, qz = estimate.T_world_body.quaternion
+    numbers = " ".join(f"{value:.9f}" for value in (x, y, z, qx, qy, qz, qw))
+    return f"{format_stamp(estimate.stamp_ns)} {numbers}\n"
+
+
+def as_json(values: Mapping[str, Any]) -> str:
+    """Return JSON with a null for every number that is not finite."""
+    return json.dumps(_finite(values), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def rig_text(source: "Source") -> str:
+    """Describe a rig in a few lines."""
+    lines = []
+    for mount in source.rig.cameras:
+        camera = mount.camera
+        lines.append(
+            f"camera {mount.name}: {camera.model}, {camera.width}x{camera.height}, "
+            f"fx {camera.fx:.2f} fy {camera.fy:.2f} cx {camera.cx:.2f} cy {camera.cy:.2f}, "
+            f"distortion {[round(float(k), 6) for k in camera.distortion]}"
+        )
+    if source.rig.imu:
+        lines.append(f"imu: {source.rig.imu.rate_hz:g} Hz")
+    lines += [f"lidar {mount.name}: {mount.rate_hz:g} Hz" for mount in source.rig.lidars]
+    return "\n".join(lines)

@@ -1,0 +1,308 @@
+"""One call from a recording to its results: source → system → files, report, numbers.
+
+    result = odomap.run("MH_01_easy", "runs/mh01")
+    result.trajectory, result.metrics["ate_rmse_m"], result.failure
+
+The output folder is tested before the first frame is tracked. While frames come, live poses are
+appended to ``trajectory_live.tum.part``, so that even a power cut leaves the path so far; at the
+end every output is written atomically, the path first, and what cannot be written does not keep
+the others from being. Ctrl-C ends tracking after the frame at hand, writes everything, and is then
+raised again as `Interrupted` with the result inside. The same recording gives the same
+trajectory.tum, byte for byte: nothing on the way to it reads a clock.
+"""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, ModuleType
+from typing import TYPE_CHECKING, Any
+
+from odomap.errors import ConfigError, InputError
+from odomap.geometry.trajectory import Trajectory
+from odomap.logbook import Logbook, skipped_numbers, versions
+from odomap.maps.estimate import Estimate
+from odomap.settings import override, read_config
+
+if TYPE_CHECKING:
+    from odomap.maps.map import Map
+    from odomap.outputs import Outputs
+    from odomap.sensors.rig import Rig
+    from odomap.sources.source import Source
+    from odomap.system.config import Config
+    from odomap.system.odometry import Result
+
+__all__ = ["Interrupted", "Progress", "RunResult", "chosen_config", "run"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        stage: what is being done: "compiling", "tracking", "writing".
+        done: steps behind: modules, frames.
+        total: steps to expect; 0 when unknown.
+        estimate: the last estimate while tracking.
+        frames_per_second: rate of tracking over the last frames.
+        text: what is being done at this step, where it has a name.
+    """
+
+    stage: str
+    done: int
+    total: int
+    estimate: Estimate | None = None
+    frames_per_second: float = 0.0
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run found.
+
+    Attributes:
+        trajectory: T_world_body of every tracked frame, with the final map.
+        trajectory_live: the same as first emitted.
+        map: the map.
+        estimates: one per frame, without tracks.
+        metrics: the content of metrics.json.
+        out: folder of the outputs, or None if none were asked for.
+        written: names of the files written there.
+        failure: why there is no usable path; empty when there is one.
+        warnings: what a person should know, one sentence each.
+    """
+
+    trajectory: Trajectory
+    trajectory_live: Trajectory
+    map: "Map"
+    estimates: tuple[Estimate, ...]
+    metrics: dict[str, Any]
+    out: Path | None
+    written: tuple[str, ...]
+    failure: str
+    warnings: tuple[str, ...]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a run; what was tracked until then is written, and in `result`."""
+
+    def __init__(self, result: RunResult) -> None:
+        super().__init__("interrupted")
+        self.result = result
+
+
+def run(
+    data: "str | Path | Source",
+    out: str | Path | None = None,
+    *,
+    preset: str | None = None,
+    config: "Config | str | Path | None" = None,
+    rig: "Rig | str | Path | None" = None,
+    rhythm: str = "inline",
+    max_frames: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    origin: Mapping[str, object] | None = None,
+) -> RunResult:
+    """Track a recording from end to end, and write its results.
+
+    Args:
+        data: a recording's folder, a world.yaml, "sim:room?seed=3&frames=100", or a `Source`.
+        out: folder for the outputs; None writes nothing.
+        preset: name of a preset; default the first one.
+        config: a `Config`, or a file to read over the preset.
+        rig: a rig or rig.yaml, for recordings that do not say what is mounted where.
+        rhythm: how stages follow each other; "inline", each in turn, is the only one yet.
+        max_frames: stop after this many frames.
+        progress: called with a `Progress` as the run goes on.
+        origin: extra keys for the head of config.yaml.
+
+    Returns:
+        Trajectories, map, metrics; `failure` says why there is no usable path.
+
+    Raises:
+        InputError: the recording, its calibration or the config is wrong.
+        OutputError: the folder cannot be written, told before tracking; or a result could not be,
+            after all others were.
+        Interrupted: Ctrl-C; the result so far is written and inside.
+
+    Example:
+        >>> result = run("sim:room?seed=3&frames=30")  # doctest: +SKIP
+        >>> result.metrics["lost"]  # doctest: +SKIP
+        0
+    """
+    from odomap.outputs import Outputs
+    from odomap.sources.source import Source
+
+    if rhythm != "inline":
+        raise ConfigError(f"rhythm '{rhythm}' does not exist in this version: use 'inline'")
+    if max_frames is not None and max_frames < 1:
+        raise InputError(f"max_frames is {max_frames}: at least 1 expected")
+    tell = progress or (lambda _: None)
+    settings = chosen_config(preset, config)
+    source = data if isinstance(data, Source) else _opened(data, rig)
+    name = data if isinstance(data, str | Path) else source.name
+    head = {"data": str(name)} | ({"preset": preset} if preset else {}) | dict(origin or {})
+    outputs = Outputs(out, settings, head) if out is not None else None
+
+    compile_s = _warm_up(tell)
+    logbook = Logbook(min(len(source), max_frames or len(source)))
+    with _deferred_interrupt() as interrupt:
+        result = _track(source, settings, logbook, outputs, max_frames, tell, interrupt)
+    metrics, warnings = _metrics(source, logbook, result)
+    metrics["compile_s"] = compile_s
+    metrics["interrupted"] = interrupt.is_set()
+    if outputs is not None:
+        tell(Progress("writing", 0, 0))
+        outputs.write(source, result, logbook, metrics, warnings)
+    finished = RunResult(
+        trajectory=result.trajectory,
+        trajectory_live=result.trajectory_live,
+        map=result.map,
+        estimates=tuple(logbook.estimates),
+        metrics=metrics,
+        out=outputs.folder if outputs else None,
+        written=outputs.written if outputs else (),
+        failure=metrics["failure"],
+        warnings=tuple(warnings),
+    )
+    if interrupt.is_set():
+        raise Interrupted(finished)
+    return finished
+
+
+def chosen_config(
+    preset: str | None = None,
+    config: "Config | str | Path | None" = None,
+    overrides: Sequence[tuple[str, str]] = (),
+) -> "Config":
+    """Return a preset, with a file read over it and single fields changed.
+
+    Args:
+        preset: name of a preset; default the first one.
+        config: a `Config`, which replaces the preset, or a file that is read over it.
+        overrides: pairs such as ``("tracking.min_inliers", "20")``.
+
+    Raises:
+        ConfigError: an unknown preset, section or field, or a value that cannot be.
+    """
+    from odomap.system.config import PRESETS, Config
+    from odomap.system.config import preset as named_preset
+
+    name = preset or next(iter(PRESETS))
+    chosen = config if isinstance(config, Config) else named_preset(name)
+    if isinstance(config, str | Path):
+        chosen = read_config(config, chosen)
+    return override(chosen, overrides)
+
+
+def _opened(data: str | Path, rig: "Rig | str | Path | None") -> "Source":
+    from odomap.sources.open import open as open_source
+
+    return open_source(data, rig)
+
+
+def _warm_up(tell: Callable[[Progress], None]) -> float:
+    """Compile, or load from the cache, what tracking needs; return the seconds it took."""
+    from odomap.system import warm_up
+
+    start = time.perf_counter()
+    warm_up(lambda done, total, name: tell(Progress("compiling", done, total, text=name)))
+    return time.perf_counter() - start
+
+
+def _track(
+    source: "Source",
+    settings: "Config",
+    logbook: Logbook,
+    outputs: "Outputs | None",
+    max_frames: int | None,
+    tell: Callable[[Progress], None],
+    interrupt: threading.Event,
+) -> "Result":
+    """Track frame after frame until the source, the limit or the user ends it."""
+    from odomap.system.odometry import StereoVO
+
+    system = StereoVO(source.rig, settings)
+    total = min(len(source), max_frames or len(source))
+    for frame in source:
+        start = time.perf_counter()
+        estimate = system.track(frame)
+        logbook.add(frame, estimate, time.perf_counter() - start)
+        if outputs is not None:
+            outputs.append(estimate)
+        done = len(logbook.estimates)
+        tell(Progress("tracking", done, total, estimate, logbook.frames_per_second))
+        if interrupt.is_set() or done == max_frames:
+            break
+    return system.finish()
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into an event, so that no frame is torn; a second one interrupts."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _metrics(
+    source: "Source", logbook: Logbook, result: "Result"
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the content of metrics.json and the warnings."""
+    from odomap.evaluation.metrics import ate
+
+    warnings = list(getattr(source, "notes", []))
+    metrics: dict[str, Any] = {"name": source.name} | logbook.numbers() | skipped_numbers(source)
+    metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
+    metrics["landmarks"] = result.map.num_landmarks
+    metrics["loops"] = 0
+    metrics["failure"] = logbook.failure()
+    metrics["ate_rmse_m"] = None
+    metrics["ate"] = None
+    if source.truth is not None:
+        try:
+            found = ate(result.trajectory, source.truth)
+        except InputError as error:
+            warnings.append(f"no comparison with the ground truth: {error}")
+        else:
+            metrics["ate_rmse_m"] = found.rmse
+            metrics["ate"] = found.as_dict()
+    if metrics["skipped"]:
+        first = source.skipped[0]
+        warnings.append(
+            f"{metrics['skipped']} measurements skipped, the first: {first.file}: {first.reason}"
+        )
+    for frame_id, seconds in logbook.gaps():
+        warnings.append(f"a gap of {seconds:.2f} s after frame {frame_id}")
+    if metrics["lost"] and not metrics["failure"]:
+        reason = next(e.reason for e in logbook.estimates if e.status.value == "lost")
+        warnings.append(f"{metrics['lost']} of {metrics['frames']} frames lost: {reason}")
+    metrics["warnings"] = warnings
+    metrics["versions"] = versions()
+    return metrics, warnings
+
+
+class _CallableModule(ModuleType):
+    """Let `odomap.run` be called, whether it is the function or, once imported, this module."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> RunResult:
+        return run(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _CallableModule
