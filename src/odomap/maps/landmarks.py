@@ -5,14 +5,14 @@ anchor keyframe; in the world it is at T_world_anchor (s_anchor p_anchor), so th
 anchor when a loop closes. Rows (slots) are used again after a landmark is gone, ids never: a table
 id → slot is kept, in which the id of a fused landmark points at the id of its survivor, as in a
 union-find forest (R. Tarjan, Efficiency of a good but not linear set union algorithm, 1975).
-Looking up N ids is O(N). The table is compacted when it would grow: paths are shortened, dead ids at
-its beginning are cut off, so that an odometry which forgets what it passed needs constant memory.
+Looking up N ids is O(N). The table is compacted when it would grow: paths are shortened, dead ids
+at its beginning are cut off, so that odometry, which forgets what it passed, needs constant memory.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import grown
+from odomap.maps.columns import distinct, grown
 from odomap.maps.ragged import Ragged
 
 __all__ = ["Landmarks"]
@@ -142,7 +142,7 @@ class Landmarks:
     def _leave_anchors(self, slots: NDArray[np.int64]) -> None:
         stays = np.ones(self._end, np.bool_)
         stays[slots] = False
-        self._by_anchor.keep(np.unique(self.anchor[slots]).astype(np.int64), stays)
+        self._by_anchor.keep(distinct(self.anchor[slots]).astype(np.int64), stays)
 
     def _vacate(self, slots: NDArray[np.int64]) -> None:
         self._leave_anchors(slots)
@@ -160,5 +160,4 @@ class Landmarks:
         self.p_anchor = grown(self.p_anchor, self._end)
         self.descriptor = grown(self.descriptor, self._end)
         self.seen = grown(self.seen, self._end)
-        rows: NDArray[np.int64] = np.r_[np.asarray(reused, np.int64), fresh]
-        return rows
+        return np.concatenate([np.asarray(reused, np.int64), fresh])

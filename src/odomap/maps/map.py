@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
+from odomap.maps.columns import distinct
 from odomap.maps.sightings import Sightings
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
@@ -70,9 +71,10 @@ class Map(Sightings):
             keyframe_ids: (n,) keyframes; culled ones are passed over.
         """
         with self.lock:
-            ids = np.unique(self._ids(keyframe_ids))
+            ids = distinct(self._ids(keyframe_ids))
             ids = ids[self._tree.status[self._all_known(ids)] == ALIVE]
-            left = np.unique(np.r_[self._drop_observations_of(ids), self._landmarks.anchored(ids)])
+            passed = self._drop_observations_of(ids), self._landmarks.anchored(ids)
+            left = distinct(np.concatenate(passed))
             self._landmarks.remove(left[self._observations.count(left) == 0])
             for k in ids.tolist():
                 self._keyframes[k] = self._keyframes[k].without_payload()
@@ -90,18 +92,18 @@ class Map(Sightings):
             sees and all their observations in these keyframes.
         """
         with self.lock:
-            fixed = self._ids(fixed_ids)
             free = self._ids(keyframe_ids)
-            wanted = dict.fromkeys(np.r_[free[~np.isin(free, fixed)], fixed].tolist())
+            held = dict.fromkeys(self._ids(fixed_ids).tolist())
+            wanted = [k for k in dict.fromkeys(free.tolist()) if k not in held] + list(held)
             kept = [k for k in wanted if self._known(k) in self._keyframes]
             if not kept:
                 raise ValueError("a snapshot needs a keyframe that is in the map")
             ids = np.asarray(kept, np.int64)
-            is_fixed = np.isin(ids, fixed)
+            is_fixed = np.array([k in held for k in kept])
             indptr, rows = self._observations.of_keyframes(ids)
             _, slots, keypoints = self._observations.columns(rows)
             position = np.repeat(np.arange(len(ids)), np.diff(indptr))
-            seen = np.unique(slots[~is_fixed[position]])
+            seen = distinct(slots[~is_fixed[position]])
             index = self._observations.positions(slots, seen)
             used = index >= 0
             Ts, scales = self.states.placements(ids)
@@ -128,7 +130,8 @@ class Map(Sightings):
             update: what was solved, from `Snapshot.solved` or made by hand.
         """
         with self.lock:
-            self._all_known(np.r_[update.anchor_id, update.keyframe_ids])
+            self._known(update.anchor_id)
+            self._all_known(update.keyframe_ids)
             C = writing.correction(self._tree, self.states, update)
             writing.move_keyframes(self._tree, self.states, update, C)
             writing.move_landmarks(self._landmarks, self.states, update, C)

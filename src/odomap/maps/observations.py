@@ -18,7 +18,7 @@ Reference: H. Strasdat et al., Double window optimisation for constant time visu
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import grown
+from odomap.maps.columns import distinct, grown
 from odomap.maps.ragged import Ragged
 
 __all__ = ["Observations"]
@@ -141,10 +141,10 @@ class Observations:
 
     def remove(self, rows: NDArray[np.int64] | NDArray[np.int32]) -> None:
         """Remove (N,) living rows."""
-        gone = np.unique(rows)
+        gone = distinct(rows.astype(np.int64))
         self._alive[gone] = False
-        self._by_keyframe.keep(np.unique(self._keyframe[gone]).astype(np.int64), self._alive)
-        self._by_landmark.keep(np.unique(self._landmark[gone]).astype(np.int64), self._alive)
+        self._by_keyframe.keep(distinct(self._keyframe[gone]).astype(np.int64), self._alive)
+        self._by_landmark.keep(distinct(self._landmark[gone]).astype(np.int64), self._alive)
         self._free.extend(gone.tolist())
 
     def reassign(self, gone: NDArray[np.int64], survivors: NDArray[np.int64]) -> None:
@@ -175,5 +175,4 @@ class Observations:
         self._landmark = grown(self._landmark, self._end)
         self._keypoint = grown(self._keypoint, self._end)
         self._alive = grown(self._alive, self._end)
-        rows: NDArray[np.int64] = np.r_[np.asarray(reused, np.int64), fresh]
-        return rows
+        return np.concatenate([np.asarray(reused, np.int64), fresh])

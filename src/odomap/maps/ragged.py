@@ -12,7 +12,7 @@ touched), whatever the size of the map; memory is at most twice the values, and 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import grown, offsets, spans
+from odomap.maps.columns import distinct, grown, offsets, spans
 
 __all__ = ["Ragged"]
 
@@ -55,13 +55,15 @@ class Ragged:
         self._cover(owners)
         order = np.argsort(owners, kind="stable")
         ordered = owners[order]
-        first = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
-        distinct = ordered[first]
-        added = np.diff(np.r_[first, len(owners)])
-        self._reserve(distinct, added)
-        at = self._start[distinct] + self._count[distinct]
+        begins = np.ones(len(owners), np.bool_)
+        begins[1:] = ordered[1:] != ordered[:-1]
+        first = np.flatnonzero(begins)
+        heads = ordered[first]
+        added = np.diff(first, append=len(owners))
+        self._reserve(heads, added)
+        at = self._start[heads] + self._count[heads]
         self._values[spans(at, added)] = values[order]
-        self._count[distinct] += added
+        self._count[heads] += added
 
     def keep(self, owners: NDArray[np.int64], wanted: NDArray[np.bool_]) -> None:
         """Drop every value v with wanted[v] false from the lists of (N,) distinct owners."""
@@ -95,7 +97,7 @@ class Ragged:
         owners, need = owners[tight], need[tight]
         capacity = np.maximum(np.exp2(np.ceil(np.log2(need))).astype(np.int64), _SMALLEST)
         start = np.zeros_like(capacity)
-        for size in np.unique(capacity).tolist():
+        for size in distinct(capacity).tolist():
             chosen = capacity == size
             start[chosen] = self._allocate(size, int(chosen.sum()))
         counts = self._count[owners]
@@ -113,12 +115,11 @@ class Ragged:
         fresh = self._end + size * np.arange(number - len(reused), dtype=np.int64)
         self._end += size * len(fresh)
         self._values = grown(self._values, self._end)
-        starts: NDArray[np.int64] = np.r_[np.asarray(reused, np.int64), fresh]
-        return starts
+        return np.concatenate([np.asarray(reused, np.int64), fresh])
 
     def _release(self, owners: NDArray[np.int64]) -> None:
         """Hand the segments of distinct owners back."""
         capacity = self._capacity[owners]
-        for size in np.unique(capacity[capacity > 0]).tolist():
+        for size in distinct(capacity[capacity > 0]).tolist():
             self._free.setdefault(size, []).extend(self._start[owners[capacity == size]].tolist())
         self._capacity[owners] = 0

@@ -12,6 +12,7 @@ system, 2015 (map points, covisibility).
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from odomap.maps.columns import distinct
 from odomap.maps.landmarks import Landmarks
 from odomap.maps.observations import Observations
 from odomap.maps.skeleton import Skeleton
@@ -57,6 +58,8 @@ class Sightings(Skeleton):
         """
         with self.lock:
             points = np.asarray(p_anchor, np.float64).reshape(-1, 3)
+            if not np.isfinite(points).all():
+                raise ValueError("add_landmarks: a place is not finite")
             anchors = np.broadcast_to(self._all_known(anchor), (len(points),)).astype(np.int64)
             stub = self._tree.status[anchors] == STUB
             if stub.any():
@@ -86,7 +89,7 @@ class Sightings(Skeleton):
     def remove_landmarks(self, landmark_ids: ArrayLike) -> None:
         """Remove landmarks and their observations; those already gone are passed over."""
         with self.lock:
-            slots = np.unique(self._landmarks.slots(self._ids(landmark_ids)))
+            slots = distinct(self._landmarks.slots(self._ids(landmark_ids)))
             slots = slots[slots >= 0]
             self._observations.remove(self._observations.of_landmarks(slots)[1])
             self._landmarks.remove(slots)
@@ -98,7 +101,8 @@ class Sightings(Skeleton):
         Args:
             survivors: (N,) ids that keep their place and descriptor.
             gone: (N,) ids that follow from now on. Pairs are taken in order and may form chains;
-                a pair with a dead landmark, or joined already, is passed over.
+                a pair with a dead landmark, or joined already, is passed over. Where a keyframe
+                sees several that are joined, the survivor's observation stays, else the oldest's.
         """
         with self.lock:
             winners = self._landmarks.slots(self._ids(survivors)).tolist()
@@ -109,7 +113,8 @@ class Sightings(Skeleton):
                 if winner >= 0 and loser >= 0 and winner != loser:
                     heir[loser] = winner
             lost = np.asarray(list(heir), np.int64)
-            kept = np.asarray([_root(heir, slot) for slot in heir], np.int64)
+            lost = lost[np.argsort(self._landmarks.ids[lost])]
+            kept = np.asarray([_root(heir, slot) for slot in lost.tolist()], np.int64)
             self._observations.reassign(lost, kept)
             self._landmarks.forward(lost, kept)
             self.version += 1
@@ -225,8 +230,8 @@ class Sightings(Skeleton):
         return slots
 
     def _points(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
-        anchors = self._landmarks.anchor[slots].astype(np.int64)
-        return act(self.states.placements(anchors), self._landmarks.p_anchor[slots])
+        anchors = self._landmarks.anchor.take(slots).astype(np.int64)
+        return act(self.states.placements(anchors), self._landmarks.p_anchor.take(slots, axis=0))
 
 
 def _root(heir: dict[int, int], slot: int) -> int:

@@ -35,8 +35,8 @@ class Update:
         landmark_ids: (m,) ids of landmarks to move.
         points_world: (m, 3) their places in the solution.
         version: of the map when the snapshot was taken; later keyframes move with their parents.
-        scales: (n,) scales in the solution; None where it has no say in them.
-        scale_anchor: scale of the anchor in the solution; None where it has no say in it.
+        scales: (n,) scales in the solution; None (with `scale_anchor`) to leave them as they are.
+        scale_anchor: scale of the anchor in the solution.
         dropped_keyframes: (d,) keyframes of observations found wrong.
         dropped_landmarks: (d,) landmarks of observations found wrong.
         dropped_keypoints: (d,) keypoints of them; with these an observation is only dropped if it
@@ -57,6 +57,26 @@ class Update:
     dropped_landmarks: NDArray[np.int64] | None = None
     dropped_keypoints: NDArray[np.int64] | None = None
     covariances: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        n, m = len(self.keyframe_ids), len(self.landmark_ids)
+        if self.Ts_world_body.shape != (n, 4, 4) or self.T_world_anchor.shape != (4, 4):
+            raise ValueError(f"update: {n} keyframes need ({n}, 4, 4) poses and a (4, 4) anchor")
+        if self.points_world.shape != (m, 3):
+            raise ValueError(f"update: {m} landmarks need ({m}, 3) points")
+        if (self.scales is None) != (self.scale_anchor is None):
+            raise ValueError("update: scales and scale_anchor come together")
+        if len(set(np.asarray(self.keyframe_ids).tolist())) != n:
+            raise ValueError("update: a keyframe comes twice")
+        scales = np.ones(1) if self.scales is None else np.append(self.scales, self.scale_anchor)
+        Ts = np.concatenate([self.Ts_world_body, self.T_world_anchor[None]])
+        if not (np.isfinite(Ts).all() and np.isfinite(self.points_world).all()):
+            raise ValueError("update: the solution is not finite, the map stays as it is")
+        if not (np.isfinite(scales).all() and (scales > 0).all()):
+            raise ValueError("update: scales must be positive")
+        R = Ts[:, :3, :3]
+        if np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() > 1e-6:
+            raise ValueError("update: a rotation is not orthonormal, the map stays as it is")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +132,7 @@ class Snapshot:
         Args:
             Ts_world_body: (n, 4, 4) solved poses of all keyframes, fixed ones included.
             points_world: (m, 3) solved places of all landmarks.
-            scales: (n,) solved scales, None if they were not part of the problem.
+            scales: (n,) solved scales, those of the snapshot if they were not part of the problem.
             dropped: (d,) indices of the observations found wrong.
             covariances: (n, 6, 6) of Ts_world_body, right tangent.
 
@@ -122,6 +142,7 @@ class Snapshot:
         free = np.flatnonzero(~self.is_fixed)
         anchor = int(np.flatnonzero(self.keyframe_ids == self.anchor_id)[0])
         wrong = np.zeros(0, np.int64) if dropped is None else dropped
+        units = self.scales if scales is None else scales
         return Update(
             anchor_id=self.anchor_id,
             T_world_anchor=Ts_world_body[anchor],
@@ -130,8 +151,8 @@ class Snapshot:
             landmark_ids=self.landmark_ids,
             points_world=points_world,
             version=self.version,
-            scales=None if scales is None else scales[free],
-            scale_anchor=None if scales is None else float(scales[anchor]),
+            scales=units[free],
+            scale_anchor=float(units[anchor]),
             dropped_keyframes=self.keyframe_ids[self.obs_keyframe[wrong]],
             dropped_landmarks=self.landmark_ids[self.obs_landmark[wrong]],
             dropped_keypoints=self.obs_keypoint[wrong],

@@ -46,15 +46,15 @@ def inverse(a: Placement) -> Placement:
 def act(a: Placement, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return S p = t + s R p for (N, 3) points and one placement or N of them."""
     T, s = a
-    rotated = (T[..., :3, :3] @ points[..., None])[..., 0]
+    rotated = np.einsum("...ij,...j->...i", T[..., :3, :3], points)
     return np.asarray(T[..., :3, 3] + np.asarray(s)[..., None] * rotated)
 
 
 def act_inverse(a: Placement, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return S⁻¹ p = Rᵀ (p - t) / s for (N, 3) points and one placement or N of them."""
     T, s = a
-    shifted = (points - T[..., :3, 3])[..., None, :]
-    return np.asarray((shifted @ T[..., :3, :3])[..., 0, :] / np.asarray(s)[..., None])
+    turned = np.einsum("...ji,...j->...i", T[..., :3, :3], points - T[..., :3, 3])
+    return np.asarray(turned / np.asarray(s)[..., None])
 
 
 class States:
@@ -116,7 +116,7 @@ class States:
 
     def placements(self, rows: NDArray[np.int64]) -> Placement:
         """Return copies of the (n, 4, 4) poses and (n,) scales of some rows."""
-        return self._Ts[rows], self._scales[rows]
+        return self._Ts.take(rows, axis=0), self._scales.take(rows)
 
     def move(self, rows: NDArray[np.int64], placements: Placement) -> None:
         """Write new poses and scales, and turn and scale what is expressed with them.

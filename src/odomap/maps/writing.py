@@ -35,7 +35,7 @@ def correction(tree: Tree, states: States, update: Update) -> Placement | None:
 def move_keyframes(tree: Tree, states: States, update: Update, C: Placement | None) -> None:
     """Write the poses of an update, and let the keyframes created since follow."""
     ids = np.asarray(update.keyframe_ids, np.int64)
-    alive = np.array([tree.status_of(i) == ALIVE for i in ids.tolist()], np.bool_)
+    alive = tree.status[ids] == ALIVE
     ids = ids[alive]
     scales = states.scales[ids] if update.scales is None else update.scales[alive]
     solved: Placement = np.asarray(update.Ts_world_body)[alive], scales
