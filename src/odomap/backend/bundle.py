@@ -1,0 +1,381 @@
+"""Bundle adjustment: poses and landmarks that agree best with all observations.
+
+    min_{T, p}  Σ_o ρ( ‖r_o(T_world_body[pose_o], p[landmark_o])‖² )
+
+over a window of poses, some of them held fixed to tie the gauge, by Levenberg-Marquardt: each step
+solves the Schur complement on the poses (see `schur`) and is taken if the cost falls. ρ is Huber's
+loss. The whole loop is one compiled call without the interpreter's lock.
+
+The covariance of the free poses, given the fixed ones, is the inverse of the undamped reduced system at
+the solution; landmarks are marginalised by the elimination itself.
+
+Reference: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999; Mouragnon et al., "Real Time
+Localization and 3D Reconstruction", CVPR 2006 (windows).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend.cholesky import factor, invert, solve
+from odomap.backend.schur import back_substitute, reduced_system, robust_cost
+from odomap.errors import InputError
+from odomap.geometry.lie_kernels import se3_retract
+from odomap.kernels import kernel
+
+__all__ = ["Bundle", "BundleConfig", "BundleSolution", "solve_bundle", "warm_up"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+REASONS = ("iteration limit", "converged", "no step lowers the cost", "the system is singular")
+
+
+@dataclass(frozen=True)
+class BundleConfig:
+    """How a bundle is solved."""
+
+    iterations: int = 8
+    """Most Levenberg-Marquardt steps tried."""
+    huber_width: float = 2.5
+    """Residual, in standard deviations, beyond which Huber's loss grows linearly."""
+    tolerance: float = 1e-4
+    """Relative decrease of the cost below which the solver stops."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle adjustment problem, as arrays.
+
+    Attributes:
+        Ts_world_body: (K, 4, 4).
+        is_fixed: (K,) bool, poses held fixed.
+        points_world: (M, 3).
+        Ts_camera_body: (C, 4, 4).
+        baselines: (C,) metres; of no meaning for observations without disparity.
+        pose, point, camera: (N,) int64 indices of each observation.
+        xy: (N, 2) measured normalised image coordinates.
+        disparity: (N,) measured disparity over focal length, NaN where there is none.
+        weights: (N, 2) inverse standard deviations of xy and of the disparity.
+    """
+
+    Ts_world_body: Array
+    is_fixed: NDArray[np.bool_]
+    points_world: Array
+    Ts_camera_body: Array
+    baselines: Array
+    pose: Index
+    point: Index
+    camera: Index
+    xy: Array
+    disparity: Array
+    weights: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.pose)
+        lengths = {len(a) for a in (self.point, self.camera, self.xy, self.disparity, self.weights)}
+        if lengths != {n}:
+            raise InputError(
+                f"bundle: observation arrays differ in length ({n} and {sorted(lengths)})"
+            )
+        if n and (
+            self.pose.max() >= len(self.Ts_world_body) or self.point.max() >= len(self.points_world)
+        ):
+            raise InputError("bundle: an observation names a pose or landmark that does not exist")
+        for name in ("Ts_world_body", "points_world", "xy", "weights"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"bundle: {name} holds a value that is not finite")
+
+
+@dataclass(frozen=True)
+class BundleSolution:
+    """What a bundle adjustment found.
+
+    Attributes:
+        Ts_world_body: (K, 4, 4), fixed poses unchanged.
+        points_world: (M, 3).
+        cost_before, cost_after: half the sum of robust squared residuals.
+        iterations: steps tried.
+        reason: why it stopped.
+        chi2: (N,) squared residuals in standard deviations; infinite behind the camera.
+        covariances: (K, 6, 6) of each pose given the fixed ones (zero for those), right tangent.
+        joint_covariance: (6F, 6F) of all free poses in order; zero if the system is singular.
+        variance_factor: χ² per degree of freedom of the inlying observations: about 1 where the
+            weights say the truth.
+    """
+
+    Ts_world_body: Array
+    points_world: Array
+    cost_before: float
+    cost_after: float
+    iterations: int
+    reason: str
+    chi2: Array
+    covariances: Array
+    joint_covariance: Array
+    variance_factor: float
+
+
+def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSolution:
+    """Adjust poses and landmarks.
+
+    Args:
+        bundle: the problem.
+        config: iterations and loss.
+
+    Returns:
+        The solution; check `reason` and the costs.
+
+    Raises:
+        InputError: if no pose is held fixed (the gauge would be free) or arrays do not match.
+    """
+    config = BundleConfig() if config is None else config
+    if not bundle.is_fixed.any():
+        raise InputError("bundle: hold at least one pose fixed, or the whole scene can drift")
+    order = np.argsort(bundle.point, kind="stable")
+    start = np.searchsorted(bundle.point[order], np.arange(len(bundle.points_world) + 1)).astype(
+        np.int64
+    )
+    column = np.where(bundle.is_fixed, -1, np.cumsum(~bundle.is_fixed) - 1).astype(np.int64)
+    free = int((~bundle.is_fixed).sum())
+    Rs = np.ascontiguousarray(bundle.Ts_world_body[:, :3, :3])
+    ts = np.ascontiguousarray(bundle.Ts_world_body[:, :3, 3])
+    points = np.array(bundle.points_world, np.float64, order="C")
+    chi2, joint, costs = np.empty(len(order)), np.zeros((6 * free, 6 * free)), np.zeros(2)
+    tried, why = _solve_kernel(
+        Rs,
+        ts,
+        column,
+        points,
+        np.ascontiguousarray(bundle.Ts_camera_body[:, :3, :3]),
+        np.ascontiguousarray(bundle.Ts_camera_body[:, :3, 3]),
+        np.asarray(bundle.baselines, np.float64),
+        start,
+        bundle.pose[order],
+        bundle.camera[order],
+        np.ascontiguousarray(bundle.xy[order]),
+        bundle.disparity[order],
+        np.ascontiguousarray(bundle.weights[order]),
+        config.huber_width,
+        config.iterations,
+        config.tolerance,
+        chi2,
+        joint,
+        costs,
+    )
+    Ts = np.array(bundle.Ts_world_body)
+    Ts[:, :3, :3], Ts[:, :3, 3] = Rs, ts
+    covariances = np.zeros((len(Ts), 6, 6))
+    for k in np.flatnonzero(column >= 0):
+        f = 6 * column[k]
+        covariances[k] = joint[f : f + 6, f : f + 6]
+    unsorted = np.empty(len(order))
+    unsorted[order] = chi2
+    return BundleSolution(
+        Ts,
+        points,
+        costs[0],
+        costs[1],
+        tried,
+        REASONS[why],
+        unsorted,
+        covariances,
+        joint,
+        _variance_factor(bundle, unsorted, config.huber_width, free),
+    )
+
+
+def _variance_factor(bundle: Bundle, chi2: Array, width: float, free: int) -> float:
+    inlier = chi2 <= width * width
+    rows = 2 * inlier.sum() + np.isfinite(bundle.disparity[inlier]).sum()
+    unknowns = 6 * free + 3 * len(np.unique(bundle.point[inlier]))
+    return float(chi2[inlier].sum() / (rows - unknowns)) if rows > unknowns else 1.0
+
+
+@kernel
+def _retract(
+    Rs: Array, ts: Array, column: Index, step: Array, Rs_new: Array, ts_new: Array
+) -> None:
+    """T ← T exp(δξ) for the free poses."""
+    for i in range(len(Rs)):
+        f = 6 * column[i]
+        if f < 0:
+            Rs_new[i], ts_new[i] = Rs[i], ts[i]
+        else:
+            se3_retract(Rs[i], ts[i], step[f : f + 6], Rs_new[i], ts_new[i])
+
+
+@kernel
+def _solve_kernel(
+    Rs: Array,
+    ts: Array,
+    column: Index,
+    points: Array,
+    Rs_cb: Array,
+    ts_cb: Array,
+    baselines: Array,
+    start: Index,
+    pose: Index,
+    camera: Index,
+    xy: Array,
+    disparity: Array,
+    weights: Array,
+    width: float,
+    iterations: int,
+    tolerance: float,
+    chi2: Array,
+    joint: Array,
+    costs: Array,
+) -> tuple[int, int]:
+    """Levenberg-Marquardt, Rs, ts and points in place; returns steps tried and a reason's index."""
+    size = len(joint)
+    S, s = np.empty((size, size)), np.empty(size)
+    W = np.empty((len(pose), 6, 3))
+    C_inverse, c = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
+    Rs_new, ts_new, moved = np.empty_like(Rs), np.empty_like(ts), np.empty_like(points)
+    cost = robust_cost(
+        Rs,
+        ts,
+        points,
+        Rs_cb,
+        ts_cb,
+        baselines,
+        start,
+        pose,
+        camera,
+        xy,
+        disparity,
+        weights,
+        width,
+        chi2,
+    )
+    costs[0] = cost
+    damping, grow = 1e-5, 4.0
+    reason, tried = 0, 0
+    while tried < iterations:
+        tried += 1
+        reduced_system(
+            Rs,
+            ts,
+            column,
+            points,
+            Rs_cb,
+            ts_cb,
+            baselines,
+            start,
+            pose,
+            camera,
+            xy,
+            disparity,
+            weights,
+            width,
+            damping,
+            S,
+            s,
+            W,
+            C_inverse,
+            c,
+        )
+        if factor(S):
+            for a in range(size):
+                s[a] = -s[a]
+            solve(S, s)
+            _retract(Rs, ts, column, s, Rs_new, ts_new)
+            back_substitute(column, start, pose, W, C_inverse, c, s, points, moved)
+            trial = robust_cost(
+                Rs_new,
+                ts_new,
+                moved,
+                Rs_cb,
+                ts_cb,
+                baselines,
+                start,
+                pose,
+                camera,
+                xy,
+                disparity,
+                weights,
+                width,
+                chi2,
+            )
+        else:
+            trial = np.inf
+        if trial < cost:
+            Rs[:], ts[:], points[:] = Rs_new, ts_new, moved
+            small = cost - trial < tolerance * cost
+            cost, damping, grow = trial, max(0.2 * damping, 1e-9), 4.0
+            if small:
+                reason = 1
+                break
+        else:
+            if damping > 1e6:
+                reason = 2
+                break
+            damping, grow = max(damping, 1e-5) * grow, 2.0 * grow
+    costs[1] = robust_cost(
+        Rs,
+        ts,
+        points,
+        Rs_cb,
+        ts_cb,
+        baselines,
+        start,
+        pose,
+        camera,
+        xy,
+        disparity,
+        weights,
+        width,
+        chi2,
+    )
+    reduced_system(
+        Rs,
+        ts,
+        column,
+        points,
+        Rs_cb,
+        ts_cb,
+        baselines,
+        start,
+        pose,
+        camera,
+        xy,
+        disparity,
+        weights,
+        width,
+        0.0,
+        S,
+        s,
+        W,
+        C_inverse,
+        c,
+    )
+    if factor(S):
+        invert(S, joint)
+    else:
+        reason = 3
+    return tried, reason
+
+
+def warm_up() -> None:
+    """Compile the kernels of this module."""
+    Ts = np.tile(np.eye(4), (2, 1, 1))
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -1, 3], [1, 1, 5], (10, 3))
+    pose, point = np.repeat([0, 1], 10), np.tile(np.arange(10), 2)
+    xy = points[point, :2] / points[point, 2:]
+    bundle = Bundle(
+        Ts,
+        np.array([True, False]),
+        points,
+        np.eye(4)[None],
+        np.array([0.1]),
+        pose,
+        point,
+        np.zeros(20, np.int64),
+        xy,
+        0.1 / points[point, 2],
+        np.full((20, 2), 400.0),
+    )
+    solve_bundle(bundle)

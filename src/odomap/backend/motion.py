@@ -1,0 +1,185 @@
+"""Motion-only bundle adjustment: one pose against landmarks held fixed.
+
+    min_T  Σ_o ρ( ‖r_o(T, p_o)‖² )
+
+by iteratively reweighted Gauss-Newton from a predicted pose, with Huber's loss first and, once the
+pose is near, observations beyond the χ² gate left out. A fixed landmark is not an exact one: its own
+uncertainty adds to that of the measurement, so weights may differ from observation to observation.
+
+Cost: O(observations) per step; 300 observations take a fraction of a millisecond.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section V.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend.cholesky import factor, invert, solve
+from odomap.backend.residuals import huber_weight, reproject, reproject_with_jacobians
+from odomap.geometry.lie_kernels import se3_retract
+from odomap.kernels import kernel
+
+__all__ = ["MotionSolution", "Sightings", "solve_motion", "warm_up"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Landmarks seen by one camera at one instant.
+
+    Attributes:
+        points_world: (N, 3).
+        xy: (N, 2) normalised image coordinates.
+        disparity: (N,) disparity over focal length, NaN where there is none.
+        weights: (N, 2) inverse standard deviations of xy and disparity.
+    """
+
+    points_world: Array
+    xy: Array
+    disparity: Array
+    weights: Array
+
+
+@dataclass(frozen=True)
+class MotionSolution:
+    """Where the body is.
+
+    Attributes:
+        T_world_body: (4, 4).
+        covariance: (6, 6), right tangent, given the landmarks; zero if `converged` is false.
+        chi2: (N,) squared residuals in standard deviations; infinite behind the camera.
+        inliers: (N,) bool.
+        converged: whether the problem was well posed and the last step small.
+    """
+
+    T_world_body: Array
+    covariance: Array
+    chi2: Array
+    inliers: NDArray[np.bool_]
+    converged: bool
+
+
+def solve_motion(
+    T_world_body: Array,
+    T_camera_body: Array,
+    baseline: float,
+    sightings: Sightings,
+    huber_width: float = 2.5,
+    gate: float = 3.5,
+    iterations: int = 10,
+) -> MotionSolution:
+    """Find the pose of a body from the landmarks one of its cameras sees.
+
+    Args:
+        T_world_body: (4, 4) predicted.
+        T_camera_body: (4, 4).
+        baseline: of the stereo pair, metres.
+        sightings: what is seen.
+        huber_width: width of the loss, standard deviations.
+        gate: residual beyond which an observation is an outlier, standard deviations.
+        iterations: most steps of each of the two rounds.
+
+    Returns:
+        The pose and which observations agree with it.
+    """
+    R = np.array(T_world_body[:3, :3], order="C")
+    t = np.array(T_world_body[:3, 3], order="C")
+    n = len(sightings.xy)
+    chi2, covariance = np.full(n, np.inf), np.zeros((6, 6))
+    converged = _solve_kernel(
+        R,
+        t,
+        np.ascontiguousarray(T_camera_body[:3, :3]),
+        np.ascontiguousarray(T_camera_body[:3, 3]),
+        baseline,
+        np.ascontiguousarray(sightings.points_world),
+        np.ascontiguousarray(sightings.xy),
+        np.ascontiguousarray(sightings.disparity),
+        np.ascontiguousarray(sightings.weights),
+        huber_width,
+        gate,
+        iterations,
+        chi2,
+        covariance,
+    )
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return MotionSolution(T, covariance, chi2, chi2 <= gate * gate, bool(converged))
+
+
+@kernel
+def _solve_kernel(
+    R: Array,
+    t: Array,
+    R_cb: Array,
+    t_cb: Array,
+    baseline: float,
+    points: Array,
+    xy: Array,
+    disparity: Array,
+    weights: Array,
+    width: float,
+    gate: float,
+    iterations: int,
+    chi2: Array,
+    covariance: Array,
+) -> bool:
+    """Gauss-Newton, R and t in place: round 0 with all observations, round 1 with those in the gate."""
+    r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    H, b = np.empty((6, 6)), np.empty(6)
+    R_new, t_new = np.empty((3, 3)), np.empty(3)
+    converged = False
+    for phase in range(2):
+        for o in range(len(xy)):
+            in_front = reproject(
+                R, t, R_cb, t_cb, baseline, points[o], xy[o], disparity[o], weights[o], r
+            )
+            chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if in_front else np.inf
+        for _ in range(iterations):
+            H[:, :] = 0.0
+            b[:] = 0.0
+            for o in range(len(xy)):
+                # A gate twice as wide at first lets back in what a poor start put outside.
+                if phase == 1 and chi2[o] > 4.0 * gate * gate:
+                    continue
+                if not reproject_with_jacobians(
+                    R, t, R_cb, t_cb, baseline, points[o], xy[o], disparity[o], weights[o], r, J, P
+                ):
+                    continue
+                w = huber_weight(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], width)
+                for a in range(6):
+                    b[a] -= w * (J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2])
+                    for c in range(a + 1):
+                        H[a, c] += w * (J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c])
+            converged = False
+            if not factor(H):
+                return False
+            solve(H, b)
+            se3_retract(R, t, b, R_new, t_new)
+            R[:], t[:] = R_new, t_new
+            size = np.sqrt(np.sum(b * b))
+            if not np.isfinite(size):
+                return False
+            if size < 1e-6:
+                converged = True
+                break
+    for o in range(len(xy)):
+        in_front = reproject(
+            R, t, R_cb, t_cb, baseline, points[o], xy[o], disparity[o], weights[o], r
+        )
+        chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if in_front else np.inf
+    invert(H, covariance)
+    return converged or size < 1e-3
+
+
+def warm_up() -> None:
+    """Compile the kernels of this module."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -1, 3], [1, 1, 5], (10, 3))
+    sightings = Sightings(
+        points, points[:, :2] / points[:, 2:], 0.1 / points[:, 2], np.full((10, 2), 400.0)
+    )
+    solve_motion(np.eye(4), np.eye(4), 0.1, sightings)

@@ -1,0 +1,195 @@
+"""Association: where the landmarks of a reference keyframe are in a new image.
+
+Two ways with one face. `FlowAssociation` aligns the patches around the reference's keypoints in the
+new image; it finds nearly all of them, to a twentieth of a pixel, as long as the view changes little.
+`DescriptorAssociation` detects features in every image and compares descriptors near the expected
+places; it costs detection and description, and survives larger changes.
+
+Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Montiel, Tardós,
+"ORB-SLAM", T-RO 2015, section V.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.vision.features import Corners, FeatureConfig, describe, detect
+from odomap.vision.flow import FlowConfig, pyramid, track
+from odomap.vision.matching import MatchConfig, match_guided
+
+__all__ = ["Association", "DescriptorAssociation", "FlowAssociation", "Reference", "View"]
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class View:
+    """One rectified image, made ready for association.
+
+    Attributes:
+        frame_id, stamp_ns: of its frame.
+        pyramid: the image and its halvings, finest first.
+        corners, descriptors: of the image; empty where association does without.
+    """
+
+    frame_id: int
+    stamp_ns: int
+    pyramid: tuple[Image, ...]
+    corners: Corners
+    descriptors: NDArray[np.uint8]
+
+    @property
+    def image(self) -> Image:
+        """The image in full resolution."""
+        return self.pyramid[0]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A keyframe as the tracker sees it.
+
+    Attributes:
+        keyframe_id: id in the map.
+        view: its image.
+        landmark_ids: (N,) landmarks seen in it.
+        keypoints: (N, 2) float64 where, rectified pixels.
+        descriptors: (N, D) uint8, D = 0 where association does without.
+        seen: (N,) number of keyframes that have seen each so far.
+        depth: (N,) metres along the optical axis, in this keyframe.
+    """
+
+    keyframe_id: int
+    view: View
+    landmark_ids: NDArray[np.int64]
+    keypoints: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    seen: NDArray[np.int64]
+    depth: NDArray[np.float64]
+
+
+class Association(Protocol):
+    """Finds landmarks in images."""
+
+    def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
+        """Make a rectified image ready."""
+        ...
+
+    def find(
+        self,
+        reference: Reference,
+        view: View,
+        rows: NDArray[np.int64],
+        guess: NDArray[np.float64],
+        warp: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return pixels (n, 2) and found (n,) of the reference's `rows`, expected at `guess` (n, 2)."""
+        ...
+
+    def extend(
+        self, view: View, occupied: NDArray[np.float64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Return up to `count` new keypoints (n, 2) away from the occupied ones, with descriptors."""
+        ...
+
+    def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the descriptors (n, D) to store with keypoints tracked into a view."""
+        ...
+
+
+@dataclass(frozen=True)
+class FlowAssociation:
+    """Follows patches; see the module."""
+
+    features: FeatureConfig
+    flow: FlowConfig
+    mask: NDArray[np.bool_]
+
+    def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
+        """Build the pyramid."""
+        none = Corners(np.empty((0, 2), np.float32), np.empty(0), np.empty(0, np.uint8))
+        return View(
+            frame_id, stamp_ns, pyramid(image, self.flow.levels), none, np.empty((0, 0), np.uint8)
+        )
+
+    def find(
+        self,
+        reference: Reference,
+        view: View,
+        rows: NDArray[np.int64],
+        guess: NDArray[np.float64],
+        warp: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Align the reference's patches."""
+        flow = track(
+            reference.view.pyramid, view.pyramid, reference.keypoints[rows], guess, self.flow, warp
+        )
+        return flow.points, flow.found
+
+    def extend(
+        self, view: View, occupied: NDArray[np.float64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Detect corners."""
+        corners = detect(view.image, self.features, count, occupied.astype(np.float32), self.mask)
+        return corners.keypoints.astype(np.float64), np.empty((len(corners.keypoints), 0), np.uint8)
+
+    def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return none: patches are compared, not descriptors."""
+        return np.empty((len(keypoints), 0), np.uint8)
+
+
+@dataclass(frozen=True)
+class DescriptorAssociation:
+    """Detects, describes and matches; see the module."""
+
+    features: FeatureConfig
+    matching: MatchConfig
+    mask: NDArray[np.bool_]
+
+    def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
+        """Detect and describe; more than a keyframe needs, since not every feature repeats."""
+        corners = detect(image, self.features, 3 * self.features.count, None, self.mask)
+        descriptors, kept = describe(image, corners, self.features.detector)
+        corners = Corners(corners.keypoints[kept], corners.strength[kept], corners.level[kept])
+        return View(frame_id, stamp_ns, (image,), corners, descriptors)
+
+    def find(
+        self,
+        reference: Reference,
+        view: View,
+        rows: NDArray[np.int64],
+        guess: NDArray[np.float64],
+        warp: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Match the reference's descriptors near the guesses."""
+        matches = match_guided(
+            reference.descriptors[rows],
+            guess,
+            view.descriptors,
+            view.corners.keypoints,
+            self.matching,
+        )
+        found = matches >= 0
+        pixels = np.array(guess)
+        pixels[found] = view.corners.keypoints[matches[found]]
+        return pixels, found
+
+    def extend(
+        self, view: View, occupied: NDArray[np.float64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Take the strongest features that no landmark has claimed."""
+        claimed = {(float(x), float(y)) for x, y in occupied.astype(np.float32)}
+        free = [
+            i
+            for i, (x, y) in enumerate(view.corners.keypoints)
+            if (float(x), float(y)) not in claimed
+        ][:count]
+        index = np.array(free, np.int64)
+        return view.corners.keypoints[index].astype(np.float64), view.descriptors[index]
+
+    def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Look up the features that landmarks were matched to."""
+        place = {(float(x), float(y)): i for i, (x, y) in enumerate(view.corners.keypoints)}
+        index = [place[(float(x), float(y))] for x, y in keypoints.astype(np.float32)]
+        return view.descriptors[np.array(index, np.int64)]

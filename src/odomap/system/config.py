@@ -1,0 +1,76 @@
+"""Configuration: the sections of all stages, gathered, and the presets.
+
+Each section is a frozen dataclass in its stage's own file, with a docstring under every field. This
+file only gathers them and names the presets.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from odomap.backend.bundle import BundleConfig
+from odomap.errors import ConfigError, nearest_name
+from odomap.system.mapping import StereoNoise, WindowConfig
+from odomap.system.tracking import TrackingConfig
+from odomap.vision.features import FeatureConfig
+from odomap.vision.flow import FlowConfig
+from odomap.vision.matching import MatchConfig
+from odomap.vision.stereo import StereoConfig
+
+__all__ = ["PRESETS", "Config", "preset"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """All sections of a run."""
+
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    """How corners are found."""
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    """How points are followed from image to image."""
+    matching: MatchConfig = field(default_factory=MatchConfig)
+    """How descriptors are matched."""
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """How disparities are measured."""
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    """How frames are placed and when one becomes a keyframe."""
+    window: WindowConfig = field(default_factory=WindowConfig)
+    """The window of keyframes adjusted together."""
+    bundle: BundleConfig = field(default_factory=BundleConfig)
+    """How a bundle is solved."""
+    noise: StereoNoise = field(default_factory=StereoNoise)
+    """Standard deviations of what is measured in the images."""
+
+
+def _stereo() -> Config:
+    return Config()
+
+
+def _stereo_orb() -> Config:
+    return Config(
+        features=FeatureConfig(detector="orb", count=700),
+        tracking=TrackingConfig(association="descriptors"),
+    )
+
+
+PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
+    {"stereo": _stereo, "stereo-orb": _stereo_orb}
+)
+"""Named configurations: stereo (optical flow, the default) and stereo-orb (descriptors)."""
+
+
+def preset(name: str) -> Config:
+    """Return a named configuration.
+
+    Args:
+        name: one of `PRESETS`.
+
+    Raises:
+        ConfigError: if there is no such preset.
+    """
+    if name not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise ConfigError(
+            f"preset '{name}' is unknown{nearest_name(name, PRESETS)}; there are: {known}"
+        )
+    return PRESETS[name]()

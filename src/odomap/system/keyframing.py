@@ -1,0 +1,170 @@
+"""Making stereo keyframes: depth for what is tracked, new landmarks where nothing is.
+
+The points tracked into the image keep their landmarks; corners are detected in the gaps between them.
+Stereo measures the disparity of both: near the expected one for tracked points, over the whole range
+for new ones. New points with a disparity become landmarks.
+
+Reference: Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017, section III-A.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import CalibrationError
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
+from odomap.system.association import Association, Reference, View
+from odomap.system.config import Config
+from odomap.vision.features import Features
+from odomap.vision.rectifier import Rectifier
+from odomap.vision.stereo import match_sparse, sgbm_disparity
+
+__all__ = ["StereoKeyframes"]
+
+Array = NDArray[np.float64]
+
+
+class StereoKeyframes:
+    """Turns views into keyframes of a map."""
+
+    def __init__(
+        self, map: Map, rectifier: Rectifier, association: Association, config: Config
+    ) -> None:
+        self._map, self._rectifier, self._association, self._config = (
+            map,
+            rectifier,
+            association,
+            config,
+        )
+
+    def make(
+        self,
+        view: View,
+        right: NDArray[np.uint8],
+        T_world_body: Array,
+        landmark_ids: NDArray[np.int64],
+        pixels: Array,
+        covariance: Array,
+        parent: int,
+    ) -> Reference:
+        """Add a keyframe with its landmarks and observations to the map.
+
+        Args:
+            view: the left image.
+            right: the raw right image.
+            T_world_body: (4, 4).
+            landmark_ids: (n,) landmarks tracked into the view.
+            pixels: (n, 2) where.
+            covariance: (6, 6) of the pose.
+            parent: keyframe it was tracked from, −1 for the first.
+
+        Returns:
+            The keyframe as the tracker needs it.
+        """
+        fresh, described = self._association.extend(
+            view, pixels, self._config.features.count - len(pixels)
+        )
+        keypoints = np.concatenate([pixels, fresh])
+        expected = self._expected_disparity(T_world_body, landmark_ids)
+        disparity = self._disparity(view, right, keypoints, expected)
+        depth = (
+            self._rectifier.camera.fx
+            * self._rectifier.baseline
+            / np.where(disparity > 0.05, disparity, np.nan)
+        )
+        # Keep what is tracked, and of what is new only what has depth.
+        keep = np.concatenate([np.ones(len(pixels), np.bool_), np.isfinite(depth[len(pixels) :])])
+        descriptors = np.concatenate([self._association.descriptors_at(view, pixels), described])[
+            keep
+        ]
+        keypoints, depth = keypoints[keep], depth[keep]
+        bearings = self._rectifier.camera.unproject(keypoints)
+        features = Features(
+            keypoints.astype(np.float32),
+            descriptors,
+            bearings,
+            depth,
+            np.zeros(len(keypoints), np.uint8),
+        )
+        keyframe_id = self._map.new_keyframe_id()
+        self._map.add_keyframe(
+            Keyframe(keyframe_id, view.stamp_ns, features),
+            T_world_body,
+            parent=parent,
+            covariance=covariance,
+        )
+        n = len(pixels)
+        points_camera = bearings[n:] / bearings[n:, 2:] * depth[n:, None]
+        T = self._rectifier.T_body_camera
+        new_ids = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
+        ids = np.concatenate([landmark_ids, new_ids])
+        self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
+        return self.reference(keyframe_id, view, keypoints, ids, descriptors)
+
+    def reference(
+        self,
+        keyframe_id: int,
+        view: View,
+        keypoints: Array,
+        ids: NDArray[np.int64],
+        descriptors: NDArray[np.uint8],
+    ) -> Reference:
+        """Gather what the tracker needs of a keyframe from the map as it is now."""
+        points = self._map.points_world(ids)
+        T = self._map.T_world_body(keyframe_id) @ self._rectifier.T_body_camera
+        depth = (points - T[:3, 3]) @ T[:3, 2]
+        good = np.isfinite(depth) & (depth > 0)
+        return Reference(
+            keyframe_id,
+            view,
+            ids[good],
+            keypoints[good],
+            descriptors[good],
+            self._map.count_observers(ids[good]),
+            depth[good],
+        )
+
+    def _expected_disparity(self, T_world_body: Array, landmark_ids: NDArray[np.int64]) -> Array:
+        T = T_world_body @ self._rectifier.T_body_camera
+        depth = (self._map.points_world(landmark_ids) - T[:3, 3]) @ T[:3, 2]
+        return np.asarray(
+            self._rectifier.camera.fx * self._rectifier.baseline / np.maximum(depth, 1e-3)
+        )
+
+    def _disparity(
+        self, view: View, right: NDArray[np.uint8], keypoints: Array, expected: Array
+    ) -> Array:
+        image = self._rectifier.rectify(right, "right")
+        config = self._config.stereo
+        if config.method == "sgbm":
+            dense = sgbm_disparity(view.image, image, config)
+            columns, rows = np.round(keypoints).astype(np.int64).T
+            return dense[rows.clip(0, len(dense) - 1), columns.clip(0, dense.shape[1] - 1)].astype(
+                np.float64
+            )
+        low = np.full(len(keypoints), -2.0)
+        high = np.full(len(keypoints), float(config.max_disparity_px))
+        low[: len(expected)], high[: len(expected)] = expected - 4.0, expected + 4.0
+        return match_sparse(view.image, image, keypoints, config, low, high)
+
+    def check_order(self, view: View, right: NDArray[np.uint8]) -> None:
+        """Raise if the two images match better the other way round.
+
+        Raises:
+            CalibrationError: if left and right are swapped.
+        """
+        image = self._rectifier.rectify(right, "right")
+        points, _ = self._association.extend(view, np.empty((0, 2)), 200)
+        matched = np.isfinite(match_sparse(view.image, image, points, self._config.stereo)).sum()
+        mirrored = match_sparse(
+            np.ascontiguousarray(view.image[:, ::-1]),
+            np.ascontiguousarray(image[:, ::-1]),
+            np.stack([view.image.shape[1] - 1 - points[:, 0], points[:, 1]], axis=1),
+            self._config.stereo,
+        )
+        swapped = int((mirrored > 1.0).sum())
+        if swapped >= 30 and swapped > 2 * matched:
+            raise CalibrationError(
+                f"stereo pair: {swapped} of {len(points)} points have negative disparity and {matched} positive: "
+                "left and right are swapped, exchange the two cameras"
+            )
