@@ -1,1 +1,1 @@
-"""How good a trajectory is."""
+"""How good a trajectory is: metrics against a reference, and tables of them."""
