@@ -28,10 +28,15 @@ class _Loader(yaml.SafeLoader):
     """Safe YAML that also reads OpenCV's matrices, as mappings."""
 
 
-_Loader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix",
-    lambda loader, node: loader.construct_mapping(node, deep=True),
-)
+def _mapping(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(
+            problem="a matrix must have rows, cols and data", problem_mark=node.start_mark
+        )
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
 
 
 def read_yaml(path: Path) -> "Fields":
@@ -48,7 +53,7 @@ def read_yaml(path: Path) -> "Fields":
         text = "\n" + text.partition("\n")[2]
     try:
         content = yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or "broken"

@@ -15,7 +15,7 @@ Cambridge University Press 2004, chapters 6 and 11.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -205,6 +205,10 @@ class Rig:
         left, right = self.cameras[:2]
         check_pair(left, right)
         return left, right
+
+    def without_imu(self) -> "Rig":
+        """Return the rig without its IMU; the body stays the frame it is."""
+        return replace(self, imu=None, body="" if self.body == "imu" else self.body)
 
     def _mounts(self) -> dict[str, SE3]:
         mounts = {} if self.imu is None else {"imu": self.imu.T_body_imu}

@@ -85,7 +85,7 @@ class EurocSource(Recording):
             name=(
                 given.resolve().parent if given.resolve().name == "mav0" else given.resolve()
             ).name,
-            rig=rig if imu is not None else replace(rig, imu=None, body=_body_without_imu(rig)),
+            rig=rig if imu is not None else rig.without_imu(),
             stamps_ns=stamps,
             cameras=cameras,
             imu=imu,
@@ -93,10 +93,6 @@ class EurocSource(Recording):
             notes=notes,
         )
         self.truth = _read_truth(root, self)
-
-
-def _body_without_imu(rig: Rig) -> str:
-    return "" if rig.body == "imu" else rig.body
 
 
 def _camera_folders(root: Path, rig: Rig | None) -> tuple[list[Path], list[str]]:

@@ -1,0 +1,97 @@
+"""What a recording holds, in numbers: for `odomap info`, and to see at once what is odd about it.
+
+Stamps are read, images are not. A gap is a step between frames longer than three usual (median)
+ones: no error, since recordings have them, but worth knowing, since a tracker may get lost there.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from odomap.errors import CalibrationError
+from odomap.sensors.rig import Rig
+from odomap.sources.source import RandomAccess, Source
+
+__all__ = ["describe"]
+
+GAP_STEPS = 3.0
+
+
+def describe(source: Source) -> dict[str, Any]:
+    """Describe a source without reading its frames.
+
+    Args:
+        source: any source; times are known of those that can be read in any order.
+
+    Returns:
+        Plain numbers, texts, lists and mappings: name, format, frames, duration_s, rate_hz, gaps,
+        cameras, stereo_baseline_m, imu_rate_hz, lidars, body, truth, skipped, notes.
+    """
+    rig = source.rig
+    return {
+        "name": source.name,
+        "format": type(source).__name__.strip("_").removesuffix("Source").lower(),
+        "frames": len(source),
+        **_times(source),
+        "cameras": [
+            {
+                "name": mount.name,
+                "model": mount.camera.model,
+                "resolution": [mount.camera.width, mount.camera.height],
+                "focal_px": [round(mount.camera.fx, 3), round(mount.camera.fy, 3)],
+                "distortion": [float(k) for k in mount.camera.distortion],
+                "rate_hz": mount.rate_hz,
+            }
+            for mount in rig.cameras
+        ],
+        "stereo_baseline_m": _baseline(rig),
+        "imu_rate_hz": None if rig.imu is None else rig.imu.rate_hz,
+        "lidars": [mount.name for mount in rig.lidars],
+        "body": rig.body_sensor,
+        "truth": _truth(source),
+        "skipped": [f"{item.file}: {item.reason}" for item in source.skipped],
+        "notes": list(getattr(source, "notes", [])),
+    }
+
+
+def _times(source: Source) -> dict[str, Any]:
+    if not isinstance(source, RandomAccess) or len(source) == 0:
+        return {"duration_s": None, "rate_hz": None, "gaps": []}
+    stamps = source.stamps_ns
+    steps = np.diff(stamps)
+    if len(steps) == 0:
+        return {"duration_s": 0.0, "rate_hz": None, "gaps": []}
+    usual = float(np.median(steps))
+    gaps = [
+        {"after_frame": int(i), "stamp_s": float(stamps[i] * 1e-9), "gap_s": float(steps[i] * 1e-9)}
+        for i in np.flatnonzero(steps > GAP_STEPS * usual)
+    ]
+    return {
+        "duration_s": float((stamps[-1] - stamps[0]) * 1e-9),
+        "rate_hz": round(1e9 / usual, 3),
+        "gaps": gaps,
+    }
+
+
+def _baseline(rig: Rig) -> float | None:
+    try:
+        left, right = rig.stereo_pair()
+    except CalibrationError:
+        return None
+    return float(np.linalg.norm(left.T_body_camera.t - right.T_body_camera.t))
+
+
+def _truth(source: Source) -> dict[str, Any] | None:
+    truth = source.truth
+    if truth is None or len(truth) == 0:
+        return None
+    facts = {
+        "poses": len(truth),
+        "duration_s": truth.duration_s,
+        "path_m": truth.path_length,
+    }
+    if isinstance(source, RandomAccess) and len(source):
+        stamps = source.stamps_ns
+        covered = (stamps >= truth.stamps_ns[0]) & (stamps <= truth.stamps_ns[-1])
+        facts["frames_covered"] = int(np.count_nonzero(covered))
+    return facts
