@@ -81,6 +81,11 @@ class Sightings(Skeleton):
             points[~gone] = self._points(slots[~gone])
             return points
 
+    def anchors(self, landmark_ids: ArrayLike) -> NDArray[np.int64]:
+        """Return the keyframes that (N,) living landmarks are stored relative to."""
+        with self.lock:
+            return self._landmarks.anchor[self._living_slots(landmark_ids)].astype(np.int64)
+
     def descriptors(self, landmark_ids: ArrayLike) -> NDArray[np.uint8]:
         """Return the (N, 32) descriptors of (N,) living landmarks."""
         with self.lock:

@@ -28,7 +28,8 @@ class Update:
     """What a solver found, relative to its anchor keyframe.
 
     Attributes:
-        anchor_id: keyframe whose pose in the map stays what it is.
+        anchor_id: keyframe whose pose in the map stays what it is (culled meanwhile, it is where
+            its stub says when the solution is written, and follows its parent from then on).
         T_world_anchor: (4, 4) its pose in the solution.
         keyframe_ids: (n,) distinct ids of keyframes to move.
         Ts_world_body: (n, 4, 4) their poses in the solution.
@@ -68,7 +69,8 @@ class Update:
             raise ValueError("update: scales and scale_anchor come together")
         if len(set(np.asarray(self.keyframe_ids).tolist())) != n:
             raise ValueError("update: a keyframe comes twice")
-        scales = np.ones(1) if self.scales is None else np.append(self.scales, self.scale_anchor)
+        scales = np.ones(0) if self.scales is None else self.scales
+        scales = np.append(scales, 1.0 if self.scale_anchor is None else self.scale_anchor)
         Ts = np.concatenate([self.Ts_world_body, self.T_world_anchor[None]])
         if not (np.isfinite(Ts).all() and np.isfinite(self.points_world).all()):
             raise ValueError("update: the solution is not finite, the map stays as it is")
