@@ -89,7 +89,7 @@ def test_what_a_file_does_not_say_stays(tmp_path):
     [
         ("sectoin: {}", "unknown field 'sectoin' (did you mean 'section'?)"),
         ("section: {cuont: 3}", "unknown field 'section.cuont' (did you mean 'count'?)"),
-        ("section: {zzz: 3}", "(known: count, folder"),
+        ("section: {zzz: 3}", "(known: active, count, folder"),
         ("section: {count: 3.5}", "field 'section.count' is 3.5, a whole number expected"),
         ("section: {count: true}", "a whole number expected"),
         ("section: {gain: many}", "field 'section.gain' is 'many', a number expected"),

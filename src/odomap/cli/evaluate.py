@@ -1,5 +1,6 @@
 """`odomap eval`: how far an estimated path is from the true one."""
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,8 +41,15 @@ class Evaluate:
 
     def execute(self) -> int:
         """Print the table, write what was asked for."""
+        from odomap.errors import InputError
+        from odomap.files.atomic import make_folder
         from odomap.files.trajectories import read_trajectory
 
+        for name, value in (("delta", self.delta), ("max-dt", self.max_dt)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"--{name} is {value:g}: a positive number expected")
+        if self.out is not None:
+            make_folder(self.out)
         estimate = read_trajectory(self.estimate)
         if ".relations" in self.reference.suffixes:
             table = self._relations(estimate)
@@ -88,13 +96,12 @@ class Evaluate:
         self, table: "Table", estimate: "Trajectory", reference: "Trajectory | None"
     ) -> None:
         """Write eval.json, and what a person wants to see of two paths."""
-        from odomap.files.atomic import make_folder, write_bytes, write_text
+        from odomap.files.atomic import write_bytes, write_text
         from odomap.views.plots import error_figure, path_3d_figure, path_figure
         from odomap.views.style import figure_png
 
         assert self.out is not None
-        folder = make_folder(self.out)
-        written = [folder / "eval.json"]
+        written = [self.out / "eval.json"]
         write_text(written[0], table.to_json() + "\n")
         if reference is not None:
             for name, draw in (
@@ -102,7 +109,7 @@ class Evaluate:
                 ("path_3d", path_3d_figure),
                 ("error", error_figure),
             ):
-                written.append(folder / f"{name}.png")
+                written.append(self.out / f"{name}.png")
                 write_bytes(written[-1], figure_png(draw(estimate, reference)))
         for path in written:
             print(f"odomap: wrote {path}", file=sys.stderr)

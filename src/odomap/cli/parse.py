@@ -157,13 +157,13 @@ def _width(argv: Sequence[str]) -> Iterator[None]:
 def _one_line(box: str, argv: Sequence[str]) -> str:
     """Return the first paragraph of tyro's boxed complaint."""
     words: list[str] = []
-    for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines():
+    # The first line is the box's title; boxes are plain where the terminal has no UTF-8.
+    for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()[1:]:
         text = line.strip("│╭╮╰╯| ").strip()
-        if line.startswith("╭"):
-            continue
-        if not text or set(text) <= {"─", "-"}:
+        if not set(text) <= {"─", "-"}:
+            words.append(text)
+        elif words:
             break
-        words.append(text)
     message = re.sub(r"^Error parsing ", "", " ".join(words)) or "cannot read the arguments"
     message = re.sub(r"^Missing from odomap \w+: (\S+).*", r"\1 is missing", message)
     message = re.sub(

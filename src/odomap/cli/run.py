@@ -121,7 +121,7 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
         lines.append(("map", f"{m['keyframes']} keyframes, {m['landmarks']} landmarks"))
         lines.append(("path", f"{m['path_m']:.3f} m in {m['duration_s']:.2f} s"))
     if m.get("ate_rmse_m") is not None:
-        share = f" ({m['ate']['rmse_pct_of_path']:.2f} % of the path)" if m["ate"] else ""
+        share = f" ({100 * m['ate_rmse_m'] / m['path_m']:.2f} % of the path)" if m["path_m"] else ""
         lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}"))
     lines.append(("peak memory", f"{m['peak_memory_mb']:.0f} MB"))
     return lines
