@@ -206,11 +206,20 @@ def _opened(data: str | Path, rig: "Rig | str | Path | None") -> "Source":
 
 
 def _warm_up(tell: Callable[[Progress], None]) -> float:
-    """Compile, or load from the cache, what tracking needs; return the seconds it took."""
-    from odomap.system import warm_up
+    """Compile, or load from the cache, the kernels of what is imported; return the seconds.
+
+    By now the source is open and the system imported: what they did not import they do not need,
+    but for geometry, which loads its kernels at their first use.
+    """
+    import odomap.system.odometry  # noqa: F401 (loads the modules whose kernels a run needs)
+    from odomap.kernels import modules_with_kernels, warm_up
 
     start = time.perf_counter()
-    warm_up(lambda done, total, name: tell(Progress("compiling", done, total, text=name)))
+    geometry = "odomap.geometry."
+    names = [n for n in modules_with_kernels() if n in sys.modules or n.startswith(geometry)]
+    for index, name in enumerate(names):
+        tell(Progress("compiling", index, len(names), text=name))
+        warm_up(name)
     return time.perf_counter() - start
 
 
