@@ -12,6 +12,7 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Update
@@ -163,7 +164,11 @@ class MapMachine(RuleBasedStateMachine):
         self.map, self.model = Map(), Model()
         self.pending = []
         self.landmarks_ever = 0
-        self.version = self.epoch = 0
+        self.version = self.epoch = self.step = 0
+
+    def rng(self, seed):
+        self.step += 1  # hypothesis likes small seeds: without this, steps would repeat each other
+        return np.random.default_rng([seed, self.step])
 
     def changed(self, epoch=False):
         assert self.map.version > self.version
@@ -176,13 +181,16 @@ class MapMachine(RuleBasedStateMachine):
 
     @initialize(seed=SEEDS)
     def begin(self, seed):
-        self.add_keyframe(seed)
-        self.add_keyframe(seed + 1)
-        self.add_landmarks(seed)
+        for _ in range(4):
+            self.add_keyframe(seed)
+            self.add_landmarks(seed)
+            self.add_landmarks(seed)
+            self.observe(seed)
+            self.observe(seed)
 
     @rule(seed=SEEDS)
     def add_keyframe(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         known = [*self.model.S, *self.model.holder]
         parent = self.some(rng, known, 1)[0] if known and rng.random() < 0.7 else -1
         T, k = random_pose(rng), self.map.new_keyframe_id()
@@ -202,7 +210,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def add_landmarks(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         number = int(rng.integers(1, 6))
         anchors = self.some(rng, [*self.model.S, *self.model.holder], number)
         p = rng.normal(size=(number, 3))
@@ -221,7 +229,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def observe(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         k = self.some(rng, self.model.S, 1)[0]
         landmarks = rng.integers(-1, self.landmarks_ever, 8)
         keypoints = rng.integers(0, 1000, 8)
@@ -240,7 +248,7 @@ class MapMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.model.holder)
     @rule(seed=SEEDS)
     def observe_from_culled(self, seed):
-        k = self.some(np.random.default_rng(seed), self.model.holder, 1)[0]
+        k = self.some(self.rng(seed), self.model.holder, 1)[0]
         assert (
             self.map.add_observations(
                 k, np.arange(self.landmarks_ever), np.arange(1000)[: self.landmarks_ever]
@@ -250,7 +258,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def remove_observations(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         pairs = self.some(rng, self.model.obs, 3)
         pairs += [(k, x + 1) for k, x in pairs]
         self.map.remove_observations([k for k, _ in pairs], [x for _, x in pairs])
@@ -260,7 +268,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def remove_landmarks(self, seed):
-        ids = np.random.default_rng(seed).integers(0, self.landmarks_ever, 2)
+        ids = self.rng(seed).integers(0, self.landmarks_ever, 2)
         self.map.remove_landmarks(ids)
         for x in ids.tolist():
             if (x := self.model.resolve(x)) >= 0:
@@ -269,7 +277,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def fuse(self, seed):
-        pairs = np.random.default_rng(seed).integers(0, self.landmarks_ever, (3, 2))
+        pairs = self.rng(seed).integers(0, self.landmarks_ever, (3, 2))
         self.map.fuse_landmarks(pairs[:, 0], pairs[:, 1])
         self.model.fuse(pairs.tolist())
         self.changed()
@@ -277,7 +285,7 @@ class MapMachine(RuleBasedStateMachine):
     @precondition(lambda self: len(self.model.S) > 2)
     @rule(seed=SEEDS)
     def cull(self, seed):
-        ids = self.some(np.random.default_rng(seed), self.model.S, 2)
+        ids = self.some(self.rng(seed), self.model.S, 2)
         frames = {k: self.map.place(k, random_pose(np.random.default_rng(k))) for k in ids}
         self.map.cull_keyframes(ids)
         for k in dict.fromkeys(ids):
@@ -290,14 +298,14 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def retire(self, seed):
-        ids = self.some(np.random.default_rng(seed), self.model.S, 1)
+        ids = self.some(self.rng(seed), self.model.S, 1)
         self.map.retire_keyframes(ids)
         self.model.retire(set(ids))
         self.changed()
 
     @rule(seed=SEEDS)
     def snapshot(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         known = [*self.model.S, *self.model.holder]
         free, fixed = self.some(rng, known, 4), self.some(rng, known, int(rng.integers(0, 3)))
         if not (set(free) | set(fixed)) & set(self.model.S):
@@ -323,7 +331,7 @@ class MapMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.pending)
     @rule(seed=SEEDS)
     def apply(self, seed):
-        rng = np.random.default_rng(seed)
+        rng = self.rng(seed)
         snapshot, taken, born = self.pending.pop(int(rng.integers(len(self.pending))))
         for name, value in vars(taken).items():
             if isinstance(value, np.ndarray):

@@ -184,8 +184,8 @@ class Skeleton:
             The row of the edge.
         """
         with self.lock:
-            self.version += 1
             ends = self._known(i), self._known(j)
+            self.version += 1
             return self._edges.add(*ends, T_i_j, information, kind, scale_i_j)
 
     def edges(self) -> EdgeTable:
