@@ -36,11 +36,11 @@ REASONS = ("iteration limit", "converged", "no step lowers the cost", "the syste
 class BundleConfig:
     """How a bundle is solved."""
 
-    iterations: int = 8
+    iterations: int = 4
     """Most Levenberg-Marquardt steps tried."""
     huber_width: float = 2.5
     """Residual, in standard deviations, beyond which Huber's loss grows linearly."""
-    tolerance: float = 1e-4
+    tolerance: float = 1e-3
     """Relative decrease of the cost below which the solver stops."""
 
 

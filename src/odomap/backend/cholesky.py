@@ -17,7 +17,7 @@ __all__ = ["factor", "invert", "solve", "warm_up"]
 Array = NDArray[np.float64]
 
 
-@kernel
+@kernel(reorder=True)
 def factor(A: Array) -> bool:
     """Overwrite the lower triangle of A (n, n) with L; False if A is not positive definite."""
     n = len(A)
@@ -40,7 +40,7 @@ def factor(A: Array) -> bool:
     return True
 
 
-@kernel
+@kernel(reorder=True)
 def solve(L: Array, b: Array) -> None:
     """Overwrite b (n,) with the solution of L Lᵀ x = b."""
     n = len(L)
@@ -55,7 +55,7 @@ def solve(L: Array, b: Array) -> None:
             b[k] -= L[i, k] * b[i]
 
 
-@kernel
+@kernel(reorder=True)
 def invert(L: Array, inverse: Array) -> None:
     """Write (L Lᵀ)⁻¹ (n, n)."""
     n = len(L)

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-@kernel
+@kernel(reorder=True)
 def invert_3x3(C: Array, inverse: Array) -> bool:
     """Write the inverse of a symmetric 3x3 by its adjugate; False if it is not positive definite."""
     c00 = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
@@ -46,7 +46,7 @@ def invert_3x3(C: Array, inverse: Array) -> bool:
     return True
 
 
-@kernel
+@kernel(reorder=True)
 def reduced_system(
     Rs: Array,
     ts: Array,
@@ -130,7 +130,7 @@ def reduced_system(
     return cost
 
 
-@kernel
+@kernel(reorder=True)
 def _eliminate(
     column: Index,
     first: int,
@@ -169,7 +169,7 @@ def _eliminate(
                     )
 
 
-@kernel
+@kernel(reorder=True)
 def back_substitute(
     column: Index,
     start: Index,
@@ -199,7 +199,7 @@ def back_substitute(
             )
 
 
-@kernel
+@kernel(reorder=True)
 def robust_cost(
     Rs: Array,
     ts: Array,

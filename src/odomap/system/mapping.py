@@ -1,8 +1,8 @@
 """Local mapping of an odometry: bundle adjustment over the last keyframes.
 
 The newest keyframes and the landmarks they see are adjusted together, held in place by the keyframes
-just before them. Observations that disagree with the solution are dropped and the rest adjusted once
-more; keyframes that leave the window are retired, so that memory stays flat.
+just before them. Observations that disagree with the solution have little weight in it (Huber) and
+are dropped for the next; keyframes that leave the window are retired, so that memory stays flat.
 
 Covariance. The window gives each keyframe's covariance S given the fixed ones. Its uncertainty in the
 world adds that of the keyframe a that ties the window, as it was when a itself was the newest:
@@ -37,7 +37,7 @@ class WindowConfig:
 
     size: int = 8
     """Keyframes adjusted."""
-    fixed: int = 4
+    fixed: int = 2
     """Older keyframes that hold them in place."""
     gate: float = 3.5
     """Residual, in standard deviations, beyond which an observation is dropped."""
@@ -49,7 +49,7 @@ class StereoNoise:
 
     position_px: float = 0.4
     """Of a tracked point's position."""
-    disparity_px: float = 0.4
+    disparity_px: float = 0.8
     """Of a stereo match's disparity."""
 
 
@@ -98,9 +98,6 @@ class WindowMapper:
         bundle = self._make_bundle(snapshot)
         solution = solve_bundle(bundle, self._bundle)
         wrong = solution.chi2 > self._window.gate**2
-        if wrong.any():
-            bundle = _without(bundle, wrong, solution)
-            solution = solve_bundle(bundle, self._bundle)
         covariances = self._world_covariances(snapshot, solution)
         self._map.apply(
             snapshot.solved(
@@ -155,22 +152,3 @@ class WindowMapper:
             Ad @ covariances[anchor] @ Ad.T + factor * solution.covariances[newest]
         )
         return covariances
-
-
-def _without(bundle: Bundle, wrong: NDArray[np.bool_], solution: BundleSolution) -> Bundle:
-    """Return the bundle at the solution with the wrong observations given no weight."""
-    weights = bundle.weights.copy()
-    weights[wrong] = 0.0
-    return Bundle(
-        solution.Ts_world_body,
-        bundle.is_fixed,
-        solution.points_world,
-        bundle.Ts_camera_body,
-        bundle.baselines,
-        bundle.pose,
-        bundle.point,
-        bundle.camera,
-        bundle.xy,
-        bundle.disparity,
-        weights,
-    )

@@ -36,8 +36,8 @@ Points = NDArray[np.float64]
 class FlowConfig:
     """How points are followed from image to image."""
 
-    half_window_px: int = 5
-    """Half the patch's side: 5 gives 11x11 pixels."""
+    half_window_px: int = 6
+    """Half the patch side: 6 gives 13x13 pixels."""
     levels: int = 3
     """Pyramid levels; each doubles the motion that can be followed."""
     iterations: int = 12
@@ -171,7 +171,7 @@ def align_patches(
     return Flow(positions, found, correlation)
 
 
-@kernel
+@kernel(reorder=True)
 def _sample_template(
     image: Image, x: float, y: float, B: NDArray[np.float64], half: int, patch: NDArray[np.float32]
 ) -> bool:
@@ -182,19 +182,33 @@ def _sample_template(
     ry = (abs(B[1, 0]) + abs(B[1, 1])) * reach
     if not (x - rx >= 0.0 and y - ry >= 0.0 and x + rx < width - 1.0 and y + ry < height - 1.0):
         return False
+    b00, b01, b10, b11 = (
+        np.float32(B[0, 0]),
+        np.float32(B[0, 1]),
+        np.float32(B[1, 0]),
+        np.float32(B[1, 1]),
+    )
+    # Offsets from a whole pixel keep single precision exact enough in large images.
+    x0, y0 = int(x) - int(rx) - 1, int(y) - int(ry) - 1
+    ox, oy = np.float32(x - x0), np.float32(y - y0)
+    i, one = 0, np.uint64(1)
     for v in range(-half - 1, half + 2):
         for u in range(-half - 1, half + 2):
-            sx = x + B[0, 0] * u + B[0, 1] * v
-            sy = y + B[1, 0] * u + B[1, 1] * v
-            ix, iy = int(sx), int(sy)
-            fx, fy = sx - ix, sy - iy
-            top = image[iy, ix] * (1.0 - fx) + image[iy, ix + 1] * fx
-            low = image[iy + 1, ix] * (1.0 - fx) + image[iy + 1, ix + 1] * fx
-            patch[v + half + 1, u + half + 1] = top * (1.0 - fy) + low * fy
+            sx = ox + b00 * np.float32(u) + b01 * np.float32(v)
+            sy = oy + b10 * np.float32(u) + b11 * np.float32(v)
+            ix, iy = np.int32(sx), np.int32(sy)
+            fx, fy = sx - np.float32(ix), sy - np.float32(iy)
+            r, c = np.uint64(y0 + iy), np.uint64(x0 + ix)  # unsigned: no test for negative indices
+            i00, i01 = np.float32(image[r, c]), np.float32(image[r, c + one])
+            i10, i11 = np.float32(image[r + one, c]), np.float32(image[r + one, c + one])
+            top = i00 + fx * (i01 - i00)
+            low = i10 + fx * (i11 - i10)
+            patch[i] = top + fy * (low - top)
+            i += 1
     return True
 
 
-@kernel
+@kernel(reorder=True)
 def _sample_target(image: Image, x: float, y: float, half: int, patch: NDArray[np.float32]) -> bool:
     """patch[v, u] = image((x, y) + (u, v)), bilinear; the four weights are the same for all pixels."""
     height, width = image.shape
@@ -207,15 +221,83 @@ def _sample_target(image: Image, x: float, y: float, half: int, patch: NDArray[n
     w00, w01 = (one - fx) * (one - fy), fx * (one - fy)
     w10, w11 = (one - fx) * fy, fx * fy
     for v in range(side):
-        upper, lower = image[top + v], image[top + v + 1]
+        upper = image[top + v, left : left + side + 1]
+        lower = image[top + v + 1, left : left + side + 1]
+        row = patch[v * side : (v + 1) * side]
         for u in range(side):
-            patch[v, u] = (
-                w00 * np.float32(upper[left + u])
-                + w01 * np.float32(upper[left + u + 1])
-                + w10 * np.float32(lower[left + u])
-                + w11 * np.float32(lower[left + u + 1])
+            row[u] = (
+                w00 * np.float32(upper[u])
+                + w01 * np.float32(upper[u + 1])
+                + w10 * np.float32(lower[u])
+                + w11 * np.float32(lower[u + 1])
             )
     return True
+
+
+@kernel(reorder=True)
+def _prepare_template(
+    wide: NDArray[np.float32],
+    side: int,
+    T: NDArray[np.float32],
+    gx: NDArray[np.float32],
+    gy: NDArray[np.float32],
+    sums: NDArray[np.float64],
+) -> None:
+    """Write T − T̄, ∇T − mean(∇T), and sums = (Σ gx², Σ gx gy, Σ gy², Σ T²)."""
+    stride, half = side + 2, np.float32(0.5)
+    mean, mean_x, mean_y = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for v in range(side):
+        above = wide[v * stride + 1 : (v + 1) * stride - 1]
+        here = wide[(v + 1) * stride : (v + 2) * stride]
+        below = wide[(v + 2) * stride + 1 : (v + 3) * stride - 1]
+        rows = slice(v * side, (v + 1) * side)
+        T_row, gx_row, gy_row = T[rows], gx[rows], gy[rows]
+        for u in range(side):
+            T_row[u] = here[u + 1]
+            gx_row[u] = half * (here[u + 2] - here[u])
+            gy_row[u] = half * (below[u] - above[u])
+            mean += T_row[u]
+            mean_x += gx_row[u]
+            mean_y += gy_row[u]
+    area = side * side
+    mean, mean_x, mean_y = mean / area, mean_x / area, mean_y / area
+    xx, xy, yy, tt = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for i in range(area):
+        T[i] -= np.float32(mean)
+        gx[i] -= np.float32(mean_x)
+        gy[i] -= np.float32(mean_y)
+        xx += gx[i] * gx[i]
+        xy += gx[i] * gy[i]
+        yy += gy[i] * gy[i]
+        tt += T[i] * T[i]
+    sums[0], sums[1], sums[2], sums[3] = xx, xy, yy, tt
+
+
+@kernel(reorder=True)
+def _compare(
+    patch: NDArray[np.float32],
+    T: NDArray[np.float32],
+    gx: NDArray[np.float32],
+    gy: NDArray[np.float32],
+    sums: NDArray[np.float64],
+) -> None:
+    """Write sums[4:] = (Σ I' T, Σ I'², Σ gx I', Σ gy I', Σ gx T, Σ gy T), I' = I − Ī."""
+    mean = np.float32(0.0)
+    area = len(T)
+    for i in range(area):
+        mean += patch[i]
+    mean = np.float32(mean / area)
+    cross, power = np.float32(0.0), np.float32(0.0)
+    bx, by, tx, ty = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for i in range(area):
+        value = patch[i] - mean
+        cross += value * T[i]
+        power += value * value
+        bx += gx[i] * value
+        by += gy[i] * value
+        tx += gx[i] * T[i]
+        ty += gy[i] * T[i]
+    sums[4], sums[5], sums[6], sums[7], sums[8], sums[9] = cross, power, bx, by, tx, ty
 
 
 @kernel
@@ -232,75 +314,39 @@ def _align_kernel(
 ) -> None:
     """Gauss-Newton on p: H δ = Σ g̃ [(I − Ī) − s (T − T̄)] / s, p ← p − δ, with g̃ = ∇T − mean(∇T)."""
     side = 2 * half + 1
-    area = np.float32(side * side)
-    wide = np.empty((side + 2, side + 2), np.float32)
-    T = np.empty((side, side), np.float32)
-    gx = np.empty((side, side), np.float32)
-    gy = np.empty((side, side), np.float32)
-    patch = np.empty((side, side), np.float32)
+    area = side * side
+    wide = np.empty((side + 2) * (side + 2), np.float32)
+    T, patch = np.empty(area, np.float32), np.empty(area, np.float32)
+    gx, gy = np.empty(area, np.float32), np.empty(area, np.float32)
+    sums = np.empty(10)
     for i in range(len(points)):
         if not (np.isfinite(positions[i, 0]) and np.isfinite(positions[i, 1])):
             continue
         if not _sample_template(template, points[i, 0], points[i, 1], warp[i], half, wide):
             continue
-        mean, mean_x, mean_y = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for v in range(side):
-            for u in range(side):
-                T[v, u] = wide[v + 1, u + 1]
-                gx[v, u] = np.float32(0.5) * (wide[v + 1, u + 2] - wide[v + 1, u])
-                gy[v, u] = np.float32(0.5) * (wide[v + 2, u + 1] - wide[v, u + 1])
-                mean += T[v, u]
-                mean_x += gx[v, u]
-                mean_y += gy[v, u]
-        mean, mean_x, mean_y = mean / area, mean_x / area, mean_y / area
-        xx, xy, yy, energy = 0.0, 0.0, 0.0, np.float32(0.0)
-        for v in range(side):
-            for u in range(side):
-                T[v, u] -= mean
-                gx[v, u] -= mean_x
-                gy[v, u] -= mean_y
-                xx += gx[v, u] * gx[v, u]
-                xy += gx[v, u] * gy[v, u]
-                yy += gy[v, u] * gy[v, u]
-                energy += T[v, u] * T[v, u]
+        _prepare_template(wide, side, T, gx, gy, sums)
+        xx, xy, yy, energy = sums[0], sums[1], sums[2], sums[3]
         det = xx * yy - xy * xy
         smallest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        if (
-            smallest < 2.0 * area or energy <= 0.0
-        ):  # less than 1.4 grey levels per pixel: no texture
+        if smallest < 2.0 * area or energy <= 0.0:  # under 1.4 grey levels per pixel: no texture
             continue
         x, y = positions[i, 0], positions[i, 1]
         for _ in range(iterations):
             if not _sample_target(target, x, y, half, patch):
                 found[i] = False
                 break
-            mean_i, cross, power = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for v in range(side):
-                for u in range(side):
-                    mean_i += patch[v, u]
-            mean_i /= area
-            for v in range(side):
-                for u in range(side):
-                    difference = patch[v, u] - mean_i
-                    patch[v, u] = difference
-                    cross += difference * T[v, u]
-                    power += difference * difference
-            gain = max(cross / energy, np.float32(0.2))
-            bx, by = np.float32(0.0), np.float32(0.0)
-            for v in range(side):
-                for u in range(side):
-                    error = patch[v, u] - gain * T[v, u]
-                    bx += gx[v, u] * error
-                    by += gy[v, u] * error
+            _compare(patch, T, gx, gy, sums)
+            gain = max(sums[4] / energy, 0.2)
+            bx, by = sums[6] - gain * sums[8], sums[7] - gain * sums[9]
             dx = (yy * bx - xy * by) / (det * gain)
             dy = (xx * by - xy * bx) / (det * gain)
             length = np.sqrt(dx * dx + dy * dy)
             if length > 2.0:  # a linearisation is good for a pixel or two
                 dx, dy = dx * 2.0 / length, dy * 2.0 / length
             x, y = x - dx, y - dy
-            correlation[i] = cross / np.sqrt(max(power * energy, np.float32(1e-12)))
+            correlation[i] = sums[4] / np.sqrt(max(sums[5] * energy, 1e-12))
             found[i] = True
-            if length < 0.01:
+            if length < 0.015:
                 break
         if found[i]:
             positions[i, 0], positions[i, 1] = x, y

@@ -47,7 +47,8 @@ class Rectifier:
                 # Fixed-point maps: the same 1/32 px as remap uses with floating ones, at half the time.
                 map_x, map_y = self.geometry.maps(which)
                 self._maps[which] = cv2.convertMaps(map_x, map_y, cv2.CV_16SC2)
-            self.mask = self._seen(*self.geometry.maps("left"), left.camera.resolution)
+            self._map_left = self.geometry.maps("left")
+            self.mask = self._seen(*self._map_left, left.camera.resolution)
 
     @staticmethod
     def _seen(
@@ -64,5 +65,14 @@ class Rectifier:
         return np.asarray(cv2.remap(image, *self._maps[which], cv2.INTER_LINEAR), np.uint8)
 
     def to_raw(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where rectified pixels (N, 2) of the left camera lie in its raw image."""
-        return pixels if self.geometry.is_identity else self.geometry.to_raw(pixels, "left")
+        """Return where rectified pixels (N, 2) of the left camera lie in its raw image, to 0.1 px.
+
+        The map is looked up at the nearest pixel; for drawing, where the exact way back through the
+        lens (`geometry.to_raw`) would cost more than tracking the points.
+        """
+        if self.geometry.is_identity or not len(pixels):
+            return pixels
+        x, y = np.round(pixels).astype(np.int64).T
+        x, y = x.clip(0, self.camera.width - 1), y.clip(0, self.camera.height - 1)
+        raw = np.stack([self._map_left[0][y, x], self._map_left[1][y, x]], axis=1)
+        return np.asarray(raw + (pixels - np.stack([x, y], axis=1)))

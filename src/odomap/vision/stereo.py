@@ -39,7 +39,7 @@ class StereoConfig:
     """Largest disparity searched; nearer points get no depth."""
     half_search_px: int = 4
     """Half the side of the window in the search along the row."""
-    half_refine_px: int = 6
+    half_refine_px: int = 4
     """Half the side of the patch in the sub-pixel step."""
     uniqueness: float = 0.85
     """The best score must be below this fraction of the best score elsewhere on the row."""
