@@ -1,0 +1,147 @@
+"""Stages: the faces of tracker, mapper and closer, blind to threads.
+
+A run is a chain of three agents over one map. The tracker places every frame; the mapper improves
+the map around each new keyframe; the closer looks for places seen before and corrects the path:
+
+    frame → Tracker.track → Estimate;  keyframe → Mapper.add → Job;  keyframe → Closer.add → Job
+
+Tracking must not wait for what takes long, so the work of mapper and closer comes in three parts:
+`add` reads the map (a snapshot: short), `Job.solve` works on what was read and touches the map no
+more (long), `Change.write` writes the result (short). A worker decides which thread runs each part
+and when; inline, one after the other; in parallel, `solve` beside later frames and `write` at a
+frame that is fixed beforehand, so that the result is the same on every run.
+
+Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR workspaces, 2007.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.maps.estimate import Estimate
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
+from odomap.maps.snapshot import Update
+from odomap.sensors.frame import Frame
+
+__all__ = ["Change", "Closer", "Job", "Loop", "MapState", "Mapper", "Solved", "Stages", "Tracker"]
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A place that was, or was not, found to be seen before.
+
+    Attributes:
+        keyframe_id: the keyframe that came back.
+        matched_id: the keyframe it came back to.
+        T_matched_keyframe: (4, 4) measured pose of the keyframe in the matched one.
+        num_inliers: matches that agree with it.
+        is_accepted: whether the map was corrected with it.
+        reason: why not; empty when it was.
+    """
+
+    keyframe_id: int
+    matched_id: int
+    T_matched_keyframe: NDArray[np.float64]
+    num_inliers: int
+    is_accepted: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class MapState:
+    """What observers are told when a map has changed.
+
+    Attributes:
+        version: of the map, grows with every change.
+        epoch: of the map, grows with every solution written.
+        num_keyframes: living keyframes.
+        num_landmarks: landmarks.
+    """
+
+    version: int
+    epoch: int
+    num_keyframes: int
+    num_landmarks: int
+
+
+class Change(Protocol):
+    """A finished piece of work, frozen, to be written into the map."""
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """Loop candidates that were decided on, accepted or not."""
+        ...
+
+    def write(self, map: Map) -> None:
+        """Write it into the map as it is now; short."""
+        ...
+
+
+class Job(Protocol):
+    """A piece of work on data already read from the map."""
+
+    def solve(self) -> Change:
+        """Do it, without touching the map; may take long and run in any thread."""
+        ...
+
+
+class Tracker(Protocol):
+    """Places frames, and makes keyframes of some."""
+
+    def track(self, frame: Frame) -> Estimate:
+        """Place a frame; its keyframe, if it became one, is in the map when this returns."""
+        ...
+
+
+class Mapper(Protocol):
+    """Improves the map around a new keyframe."""
+
+    def add(self, keyframe: Keyframe) -> Job | None:
+        """Read what is needed of the map; None if there is nothing to do."""
+        ...
+
+
+class Closer(Protocol):
+    """Recognises places seen before, and corrects the path."""
+
+    def add(self, keyframe: Keyframe) -> Job | None:
+        """Read what is needed of the map; None if there is nothing to do."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A change made of solutions: `Update`s to apply in order.
+
+    Attributes:
+        updates: what solvers found.
+        loops: loop candidates that were decided on.
+    """
+
+    updates: tuple[Update, ...]
+    loops: tuple[Loop, ...] = ()
+
+    def write(self, map: Map) -> None:
+        """Apply the updates."""
+        for update in self.updates:
+            map.apply(update)
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """The agents of a run and the map they share.
+
+    Attributes:
+        map: the only thing shared.
+        tracker: places frames.
+        mapper: improves the map; None where the tracker is all there is.
+        closer: closes loops; None where nobody looks for them.
+    """
+
+    map: Map
+    tracker: Tracker
+    mapper: Mapper | None = None
+    closer: Closer | None = None

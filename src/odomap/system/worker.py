@@ -1,0 +1,224 @@
+"""Workers: who runs which stage when. The only place with threads, queues and events.
+
+A rhythm is a class here; stages, map and observers are the same in all of them.
+
+    inline    each stage in turn: frame, then mapping, then closing; the same bytes on every run
+
+Observers are lists on the worker: `on_estimate`, `on_keyframe`, `on_loop`, `on_map` hold callables,
+which are given frozen values. One that raises is detached, its error kept in `failures` and logged;
+the run goes on. A first Ctrl-C lets the frame at hand finish, so that nothing is left half written,
+and ends the run; a second one interrupts at once.
+
+    worker = make_worker("inline", Stages(map, tracker))
+    worker.on_estimate.append(print)
+    for estimate in worker.run(source): ...
+    worker.finish()
+"""
+
+import logging
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType, MappingProxyType
+from typing import TypeVar
+
+from odomap.errors import ConfigError, nearest_name
+from odomap.maps.estimate import Estimate
+from odomap.maps.keyframes import Keyframe
+from odomap.sensors.frame import Frame
+from odomap.system.stages import Loop, MapState, Stages
+
+__all__ = [
+    "RHYTHMS",
+    "InlineWorker",
+    "ObserverFailure",
+    "Worker",
+    "deferred_interrupt",
+    "make_worker",
+]
+
+V = TypeVar("V")
+
+_LATER = ("lockstep", "live")
+
+
+@dataclass(frozen=True)
+class ObserverFailure:
+    """An observer that raised, and was detached.
+
+    Attributes:
+        event: the list it was on: "on_estimate", "on_keyframe", "on_loop" or "on_map".
+        observer: its name.
+        error: what it raised.
+    """
+
+    event: str
+    observer: str
+    error: Exception
+
+
+class Worker(ABC):
+    """Runs stages over frames, and tells observers.
+
+    Attributes:
+        stages: the agents and their map.
+        on_estimate: called with each `Estimate`.
+        on_keyframe: called with each new `Keyframe`.
+        on_loop: called with each `Loop` decided on.
+        on_map: called with a `MapState` when the map has changed.
+        failures: observers that were detached because they raised.
+        interrupted: whether Ctrl-C ended the last `run`.
+    """
+
+    def __init__(self, stages: Stages) -> None:
+        self.stages = stages
+        self.on_estimate: list[Callable[[Estimate], object]] = []
+        self.on_keyframe: list[Callable[[Keyframe], object]] = []
+        self.on_loop: list[Callable[[Loop], object]] = []
+        self.on_map: list[Callable[[MapState], object]] = []
+        self.failures: list[ObserverFailure] = []
+        self.interrupted = False
+        self._told_version = stages.map.version
+
+    @abstractmethod
+    def _advance(self, frame: Frame) -> Estimate:
+        """Take one frame through the stages, as far as the rhythm goes, and return its estimate."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Wait until all stages are at rest: nothing is written to the map after this returns."""
+
+    def track(self, frame: Frame) -> Estimate:
+        """Take one frame through the stages, as far as the rhythm goes.
+
+        Args:
+            frame: the next one in time.
+
+        Returns:
+            Its estimate.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed meanwhile; the frame is done all the same.
+        """
+        with deferred_interrupt() as interrupt:
+            estimate = self._advance(frame)
+        if interrupt.is_set():
+            raise KeyboardInterrupt
+        return estimate
+
+    def run(self, frames: Iterable[Frame]) -> Iterator[Estimate]:
+        """Track frame after frame, until they end or Ctrl-C is pressed (`interrupted`).
+
+        Args:
+            frames: in order of time, such as a source.
+
+        Yields:
+            The estimate of each frame.
+        """
+        self.interrupted = False
+        with deferred_interrupt() as interrupt:
+            for frame in frames:
+                if not interrupt.is_set():
+                    yield self._advance(frame)
+                self.interrupted = interrupt.is_set()
+                if self.interrupted:
+                    break
+
+    def _tell(self, event: str, observers: list[Callable[[V], object]], value: V) -> None:
+        for observer in tuple(observers):
+            try:
+                observer(value)
+            except Exception as error:
+                if observer in observers:
+                    observers.remove(observer)
+                name = getattr(observer, "__qualname__", type(observer).__qualname__)
+                self.failures.append(ObserverFailure(event, name, error))
+                logging.getLogger(__name__).error(
+                    "%s: observer %s raised and is detached", event, name, exc_info=error
+                )
+
+    def _tell_map(self) -> None:
+        """Tell about the map if it has changed since last told."""
+        with self.stages.map.lock:
+            m = self.stages.map
+            state = MapState(m.version, m.epoch, m.num_keyframes, m.num_landmarks)
+        if state.version != self._told_version:
+            self._told_version = state.version
+            self._tell("on_map", self.on_map, state)
+
+
+class InlineWorker(Worker):
+    """Each stage in turn, in the caller's thread; observers too."""
+
+    def _advance(self, frame: Frame) -> Estimate:
+        """Track a frame; if it became a keyframe, map and close before returning."""
+        estimate = self.stages.tracker.track(frame)
+        self._tell("on_estimate", self.on_estimate, estimate)
+        if estimate.is_keyframe:
+            keyframe = self.stages.map.keyframe(estimate.keyframe_id)
+            self._tell("on_keyframe", self.on_keyframe, keyframe)
+            for stage in (self.stages.mapper, self.stages.closer):
+                job = stage.add(keyframe) if stage is not None else None
+                if job is None:
+                    continue
+                change = job.solve()
+                change.write(self.stages.map)
+                for loop in change.loops:
+                    self._tell("on_loop", self.on_loop, loop)
+        self._tell_map()
+        return estimate
+
+    def finish(self) -> None:
+        """Do nothing but tell the last of the map: inline, every stage is at rest after a frame."""
+        self._tell_map()
+
+
+RHYTHMS: Mapping[str, Callable[[Stages], Worker]] = MappingProxyType({"inline": InlineWorker})
+"""The rhythms there are, by name."""
+
+
+def make_worker(rhythm: str, stages: Stages) -> Worker:
+    """Return a worker of the rhythm asked for.
+
+    Args:
+        rhythm: one of `RHYTHMS`.
+        stages: the agents of the run.
+
+    Raises:
+        ConfigError: if this version has no such rhythm.
+    """
+    if rhythm not in RHYTHMS:
+        known = ", ".join(RHYTHMS)
+        why = "is not in this version" if rhythm in _LATER else "is unknown"
+        near = nearest_name(rhythm, RHYTHMS)
+        raise ConfigError(f"rhythm: '{rhythm}' {why}{near}; use one of: {known}")
+    return RHYTHMS[rhythm](stages)
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into an event, so that no frame is torn; a second one interrupts.
+
+    Outside the main thread, which alone receives Ctrl-C, the event is never set.
+
+    Yields:
+        The event; look at it between frames.
+    """
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
