@@ -183,16 +183,16 @@ def _retimed(
 
 def _seekable(source: Source) -> RandomAccess:
     """Return the source as one that can be read in any order."""
-    inner = source
-    while isinstance(inner, _Wrapper):
-        inner = inner.source
-    if not isinstance(inner, RandomAccess) or not isinstance(source, RandomAccess):
+    if not isinstance(source, RandomAccess):
         raise InputError(f"{source.name}: is a stream: it can only be played forwards")
     return source
 
 
 class _Wrapper:
     """What all wrappers share: the face of the source inside."""
+
+    stamps_ns: NDArray[np.int64]
+    """(N,) stamps of the frames; only there if they can be read in any order."""
 
     def __init__(self, source: Source, how: str) -> None:
         self.source = source
@@ -201,6 +201,8 @@ class _Wrapper:
         self.truth = source.truth
         self.skipped: list[Skipped] = []
         self.notes: list[str] = list(getattr(source, "notes", []))
+        if isinstance(source, RandomAccess):
+            self.stamps_ns = source.stamps_ns
 
     def __len__(self) -> int:
         return len(self.source)
@@ -234,11 +236,6 @@ class _Changed(_Wrapper):
         """Yield the frames, changed."""
         return map(self._change, self._frames())
 
-    @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """(N,) stamps of the frames."""
-        return self._inside.stamps_ns
-
     def frame(self, index: int) -> Frame:
         """Return one frame, changed."""
         return self._change(self._inside.frame(index))
@@ -259,11 +256,6 @@ class _Frozen(_Wrapper):
                 shown = frame
             yield replace(frame, images=shown.images, depth=shown.depth)
 
-    @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """(N,) stamps of the frames."""
-        return self._inside.stamps_ns
-
     def frame(self, index: int) -> Frame:
         """Return one frame; if chosen, with the images of the last that is not."""
         frame = self._inside.frame(index)
@@ -281,6 +273,8 @@ class _Dropped(_Wrapper):
         super().__init__(source, "dropped")
         self._chosen = chosen
         self._kept = np.flatnonzero([i not in chosen for i in super().ids.tolist()])
+        if isinstance(source, RandomAccess):
+            self.stamps_ns = source.stamps_ns[self._kept]
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -299,11 +293,6 @@ class _Dropped(_Wrapper):
             if frame.id not in self._chosen:
                 yield replace(frame, imu=ImuSamples.joined(waiting)) if waiting else frame
                 waiting = []
-
-    @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """(N,) stamps of the frames that are left."""
-        return self._inside.stamps_ns[self._kept]
 
     def frame(self, index: int) -> Frame:
         """Return one of the frames that are left, with the samples of those dropped before it.

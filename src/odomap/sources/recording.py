@@ -37,7 +37,7 @@ class CameraFiles:
     form: ImageFormat
 
 
-@dataclass
+@dataclass(eq=False, repr=False)
 class Recording:
     """A source made of image files; a `RandomAccess`.
 
@@ -68,6 +68,10 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __repr__(self) -> str:
+        cameras = ", ".join(mount.name for mount in self.rig.cameras)
+        return f"{type(self).__name__}({self.name}: {len(self)} frames of {cameras})"
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames that can be read.

@@ -1,0 +1,121 @@
+"""Small recordings in the layouts of EuRoC and KITTI, written for a test and then broken by it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+START_NS = 1403636584763555584
+STEP_NS = 50_000_000
+SIZE = (64, 48)
+
+SENSOR = """%YAML:1.0
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, {x},
+         0.0, 1.0, 0.0, 0.02,
+         0.0, 0.0, 1.0, 0.03,
+         0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [50.0, 50.0, 32.0, 24.0]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.1, 0.01, 0.0001, 0.0002]
+"""
+IMU = """sensor_type: imu
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 200
+gyroscope_noise_density: 1.6968e-04
+gyroscope_random_walk: 1.9393e-05
+accelerometer_noise_density: 2.0000e-3
+accelerometer_random_walk: 3.0000e-3
+"""
+
+
+def picture(index: int, camera: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
+    """Return a textured image whose first pixels say which it is."""
+    rng = np.random.default_rng((index, camera))
+    image = rng.integers(40, 200, (size[1], size[0]), dtype=np.uint8)
+    image[:4, :4] = index
+    image[:4, 4:8] = camera
+    return image
+
+
+def save(path: Path, image: NDArray[np.generic]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done, data = cv2.imencode(path.suffix, image)
+    assert done
+    path.write_bytes(data.tobytes())
+
+
+def write_euroc(root: Path, frames: int = 6, cameras: int = 2) -> Path:
+    """Write a EuRoC recording and return its `mav0`."""
+    mav0 = root / "mav0"
+    stamps = [START_NS + i * STEP_NS for i in range(frames)]
+    for camera in range(cameras):
+        folder = mav0 / f"cam{camera}"
+        rows = ["#timestamp [ns],filename"]
+        for index, stamp in enumerate(stamps):
+            save(folder / "data" / f"{stamp}.png", picture(index, camera))
+            rows.append(f"{stamp},{stamp}.png")
+        (folder / "data.csv").write_text("\n".join(rows) + "\n")
+        (folder / "sensor.yaml").write_text(SENSOR.format(x=0.11 * camera))
+    (mav0 / "imu0").mkdir()
+    (mav0 / "imu0" / "sensor.yaml").write_text(IMU)
+    samples = [
+        f"{START_NS - STEP_NS + k * STEP_NS // 10},{k},0,0,9.8,0,0" for k in range(frames * 10 + 10)
+    ]
+    (mav0 / "imu0" / "data.csv").write_text("#header\n" + "\n".join(samples) + "\n")
+    truth = mav0 / "state_groundtruth_estimate0" / "data.csv"
+    truth.parent.mkdir()
+    poses = [
+        f"{START_NS + k * STEP_NS // 2},{k / 2},0,0,1,0,0,0" for k in range(-2, 2 * frames + 2)
+    ]
+    truth.write_text("#header\n" + "\n".join(poses) + "\n")
+    return mav0
+
+
+def write_kitti(root: Path, frames: int = 6, pair: tuple[int, ...] = (0, 1)) -> Path:
+    """Write a KITTI sequence and return its folder; camera c stands 0.5 m right of camera c - 1."""
+    for number in pair:
+        for index in range(frames):
+            save(root / f"image_{number}" / f"{index:06d}.png", picture(index, number))
+    rows = []
+    for number in range(4):
+        row = [50, 0, 32, -25.0 * number, 0, 50, 24, 0, 0, 0, 1, 0]
+        rows.append(f"P{number}: " + " ".join(f"{value:.12e}" for value in row))
+    (root / "calib.txt").write_text("\n".join(rows) + "\n")
+    (root / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(frames)))
+    (root / "poses.txt").write_text(
+        "".join(f"1 0 0 0 0 1 0 0 0 0 1 {1.5 * i}\n" for i in range(frames))
+    )
+    return root
+
+
+@pytest.fixture
+def euroc(tmp_path: Path) -> Callable[..., Path]:
+    return lambda **options: write_euroc(tmp_path / "MH_00", **options)
+
+
+@pytest.fixture
+def kitti(tmp_path: Path) -> Callable[..., Path]:
+    return lambda **options: write_kitti(tmp_path / "07", **options)
+
+
+@pytest.fixture
+def save_image() -> Callable[[Path, NDArray[np.generic]], None]:
+    return save
+
+
+@pytest.fixture
+def draw() -> Callable[..., NDArray[np.uint8]]:
+    return picture
