@@ -146,7 +146,7 @@ def _spans_kernel(polygon: Array, count: int, place_y: float, height: int, spans
     if not (low < height and high > -1.0):
         return 0
     first = max(0, int(np.ceil(max(low, -9.0) - place_y)))
-    end = min(height, int(np.ceil(min(high, height + 9.0) - place_y)))
+    end = max(0, min(height, int(np.ceil(min(high, height + 9.0) - place_y))))
     for row in range(first, end):
         spans[0, row], spans[1, row] = 1e30, -1e30
     for k in range(count):
