@@ -1,0 +1,137 @@
+"""The house keeps its shape: floors, sizes, names, and what an import may cost."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import grimp
+import pytest
+from importlinter import cli
+
+import odomap
+
+SOURCE = Path(odomap.__file__).parent
+ROOT = Path(__file__).parent.parent
+FILES = sorted(SOURCE.rglob("*.py"))
+BANNED = {"utils", "util", "common", "helpers", "helper", "base", "manager", "misc", "core"}
+
+THREADS = {"threading", "queue", "multiprocessing", "_thread", "asyncio"}
+MAY_IMPORT_THREADS = {
+    "system/worker.py": "runs the stages",
+    "maps/skeleton.py": "the lock of the map",
+    "run.py": "Ctrl-C as an event",
+}
+
+MAX_FILE, MAX_FUNCTION, MAX_KERNEL = 400, 60, 120
+
+
+def name_of(path):
+    return str(path.relative_to(SOURCE))
+
+
+@pytest.fixture(scope="module")
+def graph():
+    """Return who imports whom, imports within functions and for types only included."""
+    return grimp.build_graph("odomap", cache_dir=None)
+
+
+@pytest.fixture(scope="module", params=FILES, ids=name_of)
+def module(request):
+    return request.param, ast.parse(request.param.read_text("utf-8"))
+
+
+def test_rooms_stand_on_floors(capsys):
+    code = cli.lint_imports(config_filename=str(ROOT / ".importlinter"), no_cache=True)
+    assert code == cli.EXIT_STATUS_SUCCESS, capsys.readouterr().out
+
+
+def test_nobody_imports_the_face(graph):
+    assert graph.find_modules_that_directly_import("odomap") == set()
+
+
+def test_the_graph_counts_lazy_and_type_only_imports(graph):
+    # odomap.maps.keyframes imports Features for its types only, odomap.kernels numba when called
+    assert "odomap.vision.features" in graph.find_modules_directly_imported_by(
+        "odomap.maps.keyframes"
+    )
+    lazy = graph.find_modules_directly_imported_by("odomap.run")
+    assert "odomap.sources.open" in lazy
+
+
+def test_a_file_is_short(module):
+    path, _ = module
+    lines = len(path.read_text("utf-8").splitlines())
+    assert lines <= MAX_FILE, f"{name_of(path)}: {lines} lines"
+
+
+def is_kernel(function):
+    return any(isinstance(d, ast.Name) and d.id == "kernel" for d in function.decorator_list)
+
+
+def length_of_docstring(node):
+    """Return its lines, which do not count as the function's: what explains may be long."""
+    return node.body[0].end_lineno - node.body[0].lineno + 1 if ast.get_docstring(node) else 0
+
+
+def test_a_function_is_short(module):
+    path, tree = module
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = node.end_lineno - node.lineno + 1 - length_of_docstring(node)
+            limit = MAX_KERNEL if is_kernel(node) else MAX_FUNCTION
+            assert lines <= limit, f"{name_of(path)}: {node.name} has {lines} lines of {limit}"
+
+
+def test_a_module_says_what_it_offers(module):
+    path, tree = module
+    if path.name in ("__init__.py", "__main__.py") and path.parent != SOURCE:
+        return  # a room's door: its modules say it
+    if path == SOURCE / "__main__.py":
+        return
+    targets = [
+        node.targets[0].id
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    ]
+    assert "__all__" in targets, f"{name_of(path)} has no __all__"
+
+
+def test_a_module_explains_itself(module):
+    path, tree = module
+    text = ast.get_docstring(tree)
+    assert text, f"{name_of(path)} has no docstring"
+    assert len(text.splitlines()) <= 25, f"{name_of(path)}: the docstring is over 25 lines"
+
+
+def test_no_module_is_a_drawer(module):
+    path, _ = module
+    assert path.stem not in BANNED
+    assert not set(path.relative_to(SOURCE).parts[:-1]) & BANNED
+
+
+def test_no_module_keeps_state(module):
+    path, tree = module
+    for node in ast.walk(tree):
+        assert not isinstance(node, ast.Global), f"{name_of(path)}:{node.lineno}: global"
+    for node in tree.body:
+        values = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        if isinstance(values, ast.List | ast.Set | ast.ListComp | ast.SetComp):
+            assert isinstance(target, ast.Name)
+            assert target.id == "__all__", f"{name_of(path)}:{node.lineno}: a mutable {target.id}"
+
+
+def test_importing_the_face_is_light():
+    code = (
+        "import sys, odomap; print(*sorted({'numba', 'cv2', 'scipy', 'numpy'} & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numba", "cv2"} & set(run.stdout.split())
+
+
+def test_only_the_worker_makes_threads(module):
+    path, tree = module
+    imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    imported |= {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+    assert not imported & THREADS or name_of(path) in MAY_IMPORT_THREADS
