@@ -45,7 +45,7 @@ def picture(index: int, camera: int, size: tuple[int, int] = SIZE) -> NDArray[np
     """Return a textured image whose first pixels say which it is."""
     rng = np.random.default_rng((index, camera))
     image = rng.integers(40, 200, (size[1], size[0]), dtype=np.uint8)
-    image[:4, :4] = index
+    image[:4, :4] = index % 256
     image[:4, 4:8] = camera
     return image
 

@@ -133,6 +133,20 @@ def test_truncated_images_are_refused(
         decode(path)
 
 
+def test_a_thumbnail_does_not_hide_that_a_jpeg_is_truncated(
+    tmp_path: Path, save_image: Save
+) -> None:
+    path = tmp_path / "a.jpg"
+    save_image(path, scene())
+    data = path.read_bytes()
+    thumbnail = b"\xff\xe1\x00\x0aExif\xff\xd8\xff\xd9"
+    path.write_bytes(data[:2] + thumbnail + data[2:])
+    assert decode(path).shape == (120, 160, 3)
+    path.write_bytes(data[:2] + thumbnail + data[2 : len(data) * 3 // 4])
+    with pytest.raises(BadImage, match="truncated"):
+        decode(path)
+
+
 def test_damaged_png_is_refused(tmp_path: Path, save_image: Save) -> None:
     path = tmp_path / "a.png"
     save_image(path, scene())

@@ -76,6 +76,17 @@ def test_unrecognised_file(tmp_path: Path) -> None:
         open_source(tmp_path / "a.bag")
 
 
+def test_folder_that_may_not_be_read(kitti: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = kitti()
+
+    def refuse(self: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(InputError, match=r"image_0: Permission denied"):
+        open_source(root)
+
+
 def test_around_a_recording(euroc: Make, kitti: Make, tmp_path: Path) -> None:
     mav0 = euroc()
     with pytest.raises(InputError, match=rf"holds one: open {mav0.parent}$"):

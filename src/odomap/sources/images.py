@@ -141,7 +141,8 @@ def check_complete(data: bytes) -> None:
     """Raise BadImage if the bytes of a PNG or JPEG end early or are damaged."""
     if data.startswith(_PNG):
         _check_png(data)
-    elif data.startswith(_JPEG) and data.rfind(b"\xff\xd9") < 0:
+    elif data.startswith(_JPEG) and data.rfind(b"\xff\xd9") < len(data) // 2:
+        # An end marker in the first half is that of a thumbnail.
         raise BadImage("JPEG is truncated (no end marker)")
 
 

@@ -46,7 +46,13 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
     """
     if isinstance(path, str) and path.startswith("sim:"):
         return _simulated(path, rig)
-    root = Path(path)
+    try:
+        return _recognised(Path(path), rig)
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: {error.strerror or error}") from error
+
+
+def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
     if not root.exists():
         raise InputError(_missing(root))
     if root.is_file():
