@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["distinct", "grown", "offsets", "spans"]
+__all__ = ["distinct", "grown", "members", "offsets", "spans"]
 
 S = TypeVar("S", bound=np.generic)
 
@@ -60,6 +60,13 @@ def distinct(values: NDArray[S]) -> NDArray[S]:
     first = np.ones(len(ordered), np.bool_)
     first[1:] = ordered[1:] != ordered[:-1]
     return ordered[first]
+
+
+def members(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distinct values of (N,) row numbers, ascending, in O(N + largest)."""
+    is_member = np.zeros(int(values.max(initial=-1)) + 1, np.bool_)
+    is_member[values] = True
+    return np.flatnonzero(is_member)
 
 
 def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
-from odomap.maps.columns import distinct
+from odomap.maps.columns import distinct, members
 from odomap.maps.sightings import Sightings
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
@@ -80,12 +80,15 @@ class Map(Sightings):
                 self._keyframes[k] = self._keyframes[k].without_payload()
             self.version += 1
 
-    def snapshot(self, keyframe_ids: ArrayLike, fixed_ids: ArrayLike = ()) -> Snapshot:
+    def snapshot(
+        self, keyframe_ids: ArrayLike, fixed_ids: ArrayLike = (), *, landmarks: bool = True
+    ) -> Snapshot:
         """Copy a part of the map for a solver.
 
         Args:
             keyframe_ids: keyframes to solve for; those culled meanwhile are left out.
             fixed_ids: keyframes that hold them in place; one in both lists is fixed.
+            landmarks: whether landmarks and observations are wanted; a pose graph needs none.
 
         Returns:
             The keyframes in the order given, fixed ones last, with the landmarks that a free one
@@ -100,10 +103,10 @@ class Map(Sightings):
                 raise ValueError("a snapshot needs a keyframe that is in the map")
             ids = np.asarray(kept, np.int64)
             is_fixed = np.array([k in held for k in kept])
-            indptr, rows = self._observations.of_keyframes(ids)
+            indptr, rows = self._observations.of_keyframes(ids if landmarks else ids[:0])
             _, slots, keypoints = self._observations.columns(rows)
-            position = np.repeat(np.arange(len(ids)), np.diff(indptr))
-            seen = distinct(slots[~is_fixed[position]])
+            position = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+            seen = members(slots[~is_fixed[position]])
             index = self._observations.positions(slots, seen)
             used = index >= 0
             Ts, scales = self.states.placements(ids)

@@ -108,7 +108,7 @@ class Observations:
         highest = max(int(landmarks.max(initial=-1)), int(of.max(initial=-1)))
         self._mark = grown(self._mark, highest + 1, fill=-1)
         self._mark[of] = np.arange(len(of), dtype=np.int32)
-        where = self._mark[landmarks].astype(np.int64)
+        where = self._mark.take(landmarks).astype(np.int64)
         self._mark[of] = -1
         return where
 
