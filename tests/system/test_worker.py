@@ -87,7 +87,7 @@ def test_inline_runs_each_stage_in_turn():
     worker, log = make()
     estimates = list(worker.run(frames(5)))
     worker.finish()
-    assert [e.frame_id for e in estimates] == [0, 1, 2, 3, 4]
+    assert [(f.id, e.frame_id) for f, e in estimates] == [(n, n) for n in range(5)]
     assert log == [
         *[("track", 0), ("tracked", 0), ("mapper reads", 0), ("closer reads", 0)],
         *[("track", 1), ("tracked", 1), ("track", 2), ("tracked", 2), ("track", 3), ("tracked", 3)],
@@ -186,7 +186,7 @@ def test_ctrl_c_lets_the_frame_finish_and_ends_the_run():
     worker, log = make(lambda frame: press_ctrl_c() if frame.id == 3 else None)
     estimates = list(worker.run(frames(9)))
     worker.finish()
-    assert [e.frame_id for e in estimates] == [0, 1, 2, 3]
+    assert [e.frame_id for _, e in estimates] == [0, 1, 2, 3]
     assert worker.interrupted
     assert log[-1] == ("closer solves", 1)  # mapping and closing of the keyframe are done as well
     assert signal.getsignal(signal.SIGINT) is before

@@ -11,7 +11,7 @@ and ends the run; a second one interrupts at once.
 
     worker = make_worker("inline", Stages(map, tracker))
     worker.on_estimate.append(print)
-    for estimate in worker.run(source): ...
+    for frame, estimate in worker.run(source): ...
     worker.finish()
 """
 
@@ -109,20 +109,20 @@ class Worker(ABC):
             raise KeyboardInterrupt
         return estimate
 
-    def run(self, frames: Iterable[Frame]) -> Iterator[Estimate]:
+    def run(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, Estimate]]:
         """Track frame after frame, until they end or Ctrl-C is pressed (`interrupted`).
 
         Args:
             frames: in order of time, such as a source.
 
         Yields:
-            The estimate of each frame.
+            Each frame and its estimate.
         """
         self.interrupted = False
         with deferred_interrupt() as interrupt:
             for frame in frames:
                 if not interrupt.is_set():
-                    yield self._advance(frame)
+                    yield frame, self._advance(frame)
                 self.interrupted = interrupt.is_set()
                 if self.interrupted:
                     break
