@@ -157,10 +157,9 @@ def test_stages_are_stacked_to_the_whole_time(report: Report) -> None:
     figure = timing_figure(report.estimates)
     stages = stage_times(report.estimates)
     assert list(stages) == ["images", "flow", "pose", "detect", "stereo", "bundle"]
-    assert labels(figure) == set(stages)
+    assert labels(figure) == {*stages, "camera period 50 ms"}
     top = max(c.get_paths()[0].vertices[:, 1].max() for c in figure.axes[0].collections)
     assert top == pytest.approx(np.sum(list(stages.values()), axis=0).max())
-    assert any("camera period 50 ms" in t.get_text() for t in figure.axes[0].texts)
 
 
 def test_one_slow_frame_does_not_flatten_the_rest(report: Report) -> None:
@@ -174,7 +173,9 @@ def test_one_slow_frame_does_not_flatten_the_rest(report: Report) -> None:
 def test_many_stages_are_summed_and_nan_counts_as_nothing(report: Report) -> None:
     timing = {f"stage {k}": float(k) for k in range(12)} | {"odd": float("nan"), "total": 66.0}
     estimates = [replace(e, timing=timing) for e in report.estimates]
-    assert labels(timing_figure(estimates)) == {*(f"stage {k}" for k in range(6, 12)), "other"}
+    costliest = {f"stage {k}" for k in range(6, 12)}
+    assert labels(timing_figure(estimates)) >= costliest | {"other"}
+    assert "total" not in labels(timing_figure(estimates))
 
 
 def test_names_of_stages_may_be_anything(report: Report) -> None:

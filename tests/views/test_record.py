@@ -85,8 +85,8 @@ def test_significant_digits() -> None:
     [
         ("rot_deg_per_m", 0.0051, "rot", "0.00510 °/m"),
         ("rmse_m", 0.0034, "rmse", "3.4 mm"),
-        ("path_m", 1234.5, "path", "1234 m"),
-        ("ms_per_frame median", 14.2, "ms per frame median", "14.2 ms"),
+        ("path_m", 1234.5, "length of path", "1234 m"),
+        ("ms_per_frame median", 14.2, "time per frame, median", "14.2 ms"),
         ("peak_memory_mb", 412.0, "peak memory", "412 MB"),
         ("frames", 3000, "frames", "3,000"),
         ("stopped", True, "stopped", "True"),

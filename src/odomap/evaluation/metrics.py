@@ -202,7 +202,7 @@ def ate(
     """
     pairs = match(estimate, reference, max_dt_s)
     S = _alignment(pairs, align)
-    s, R, t = S.scale, S.R, S.t
+    s, R, t = S.scale if align == "sim3" else 1.0, S.R, S.t
     x, y = pairs.Ts_estimate[:, :3, 3], pairs.Ts_reference[:, :3, 3]
     d = np.linalg.norm(y - (s * x @ R.T + t), axis=1)
     Rs_true = pairs.Ts_reference[:, :3, :3]

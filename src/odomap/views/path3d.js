@@ -30,7 +30,14 @@
       }
     for (let k = 0; k < 3; k++) centre[k] = (low[k] + high[k]) / 2;
     radius = Math.max(Math.hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]) / 2, 1e-3);
-    return low[2] - 0.12 * radius;
+    const floor = low[2] - 0.12 * radius;
+    // Step back far enough to see most landmarks, but never so far that the path is a dot.
+    const away = [];
+    for (let i = 0; i < points.length; i += 3)
+      away.push(Math.hypot(points[i] - centre[0], points[i + 1] - centre[1], points[i + 2] - centre[2]));
+    away.sort((a, b) => a - b);
+    if (away.length) radius = Math.max(radius, Math.min(0.8 * away[Math.floor(0.8 * away.length)], 2.5 * radius));
+    return floor;
   };
   const floor = bounds();
 

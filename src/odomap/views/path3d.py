@@ -21,7 +21,7 @@ PATH_POINTS = 2000
 TRUTH_POINTS = 2000
 LANDMARKS = 12_000
 KEYFRAMES = 500
-SURROUNDINGS = 4.0
+SURROUNDINGS = 10.0
 """Landmarks farther from the path's middle than this many of its radii are not shown."""
 
 

@@ -6,6 +6,7 @@ thinned to what an eye can resolve. The other plots stand in `timelines` and `fr
 from here.
 """
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -75,7 +76,12 @@ def path_figure(
             ax.invert_yaxis()
     if place.distances is not None:
         _colour_bar(figure, side, place.distances)
-    legend(above, ncols=5)
+    handles, labels = above.get_legend_handles_labels()
+    ends = [k for k, label in enumerate(labels) if label in ("start", "end")]
+    # Shared between the panels, so that no legend runs into a title.
+    lines = [k for k in range(len(labels)) if k not in ends]
+    for ax, chosen in ((above, lines), (side, ends)):
+        legend(ax, handles=[handles[k] for k in chosen])
     return figure
 
 
@@ -141,14 +147,16 @@ def path_3d_figure(trajectory: Trajectory | None, truth: Trajectory | None = Non
         return _nothing(new_figure(6.4, 1.2), "no path: no frame was tracked")
     figure = new_figure(6.4, 5.2)
     figure.subplots_adjust(left=0.02, right=0.93, bottom=0.04, top=0.99)
-    ax = figure.add_subplot(projection="3d")
+    with mpl.rc_context({"grid.color": PALETTE["grid"], "axes.edgecolor": PALETTE["muted"]}):
+        ax = figure.add_subplot(projection="3d")
     assert isinstance(ax, Axes3D)
     order = (*place.ground, place.up_axis)
     sign = np.array([1.0, 1.0, place.up_sign])
     if place.truth is not None:
         true = place.truth[thin(len(place.truth), PATH_POINTS)][:, order] * sign
         ax.plot(*true.T, color=PALETTE["truth"], lw=2.2, label="truth")
-    p = place.positions[thin(len(place.positions), PATH_POINTS)][:, order] * sign
+    keep = thin(len(place.positions), PATH_POINTS)
+    p = gaps_as_nan(place.stamps_ns[keep], place.positions[keep][:, order] * sign)
     ax.plot(*p.T, color=PALETTE["estimate"], lw=1.4, label="estimate")
     ax.set_aspect("equal", adjustable="datalim")
     names = [AXES[a] for a in order]
@@ -170,7 +178,7 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
     if error is None:
         return _uncertainty(trajectory)
     figure = new_figure(9.6, 5.0)
-    grid = figure.subplots(3, 2, sharex=True, gridspec_kw={"wspace": 0.14, "hspace": 0.12})
+    grid = figure.subplots(3, 2, sharex=True, gridspec_kw={"wspace": 0.12, "hspace": 0.12})
     keep = thin(len(error.index), ERROR_POINTS)
     stamps = error.stamps_ns[keep]
     t = (stamps - stamps[0]) * 1e-9
@@ -178,7 +186,7 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
         values = error.errors[keep, first : first + 3]
         factor, unit = _scale(values, rotation=first == 3)
         for k in range(3):
-            ax = dress(grid[k, column], f"{title} [{unit}]" if k == 0 else "", y=AXES[k])
+            ax = dress(grid[k, column], f"{title} [{unit}]" if k == 0 else "")
             if error.sigmas is not None:
                 three = 3.0 * factor * error.sigmas[keep, first + k]
                 three = gaps_as_nan(stamps, three)
@@ -186,7 +194,8 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
             line = gaps_as_nan(stamps, factor * values[:, k])
             ax.axhline(0.0, color=PALETTE["muted"], lw=0.6)
             ax.plot(t, line, color=PALETTE["estimate"], lw=1.3, label="error")
-            ax.yaxis.label.set_rotation(0)
+            name = {"fontsize": 9, "fontweight": "bold", "color": PALETTE["muted"]}
+            ax.text(0.015, 0.84, AXES[k], transform=ax.transAxes, **name)  # type: ignore[arg-type]
             ax.margins(x=0.01)
         grid[2, column].set_xlabel("time [s]")
     legend(grid[0, 1])

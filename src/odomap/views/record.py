@@ -174,7 +174,9 @@ def _tracked(total: int, placed: int, starting: int) -> str:
 
 def _accuracy(report: Report) -> str:
     ate = next((of for group, of in report.scores.items() if group.upper().startswith("ATE")), {})
-    rmse, path = ate.get("rmse_m", math.nan), ate.get("path_m", math.nan)
+    rmse = ate.get("rmse_m", math.nan)
+    # The reference may go on long before and after the run: what was travelled is what counts.
+    path = report.trajectory.path_length if report.trajectory is not None else math.nan
     if math.isfinite(rmse) and path > 0:
         return f"ATE {length(rmse)} over {length(path)} ({100 * rmse / path:.2g} %)"
     if math.isfinite(rmse):

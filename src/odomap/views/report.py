@@ -149,18 +149,17 @@ def _inside(errors: NDArray[np.float64], sigmas: NDArray[np.float64]) -> str:
     if not known.any():
         return "No usable covariance was recorded."
     share = float((np.abs(errors[known]) <= 3 * sigmas[known]).mean())
-    return f"{100 * share:.1f} % of the errors lie within 3σ (99.7 % would be expected)."
+    says = f"{100 * share:.1f} % of the errors lie within 3σ (99.7 % would be expected)"
+    return f"{says}." if share > 0.9 else f"{says}: the uncertainty claimed is too small here."
 
 
 def _scores(report: Report) -> str:
-    rows = []
+    groups = []
     for group, values in report.scores.items():
-        for name, value in values.items():
-            label, shown = value_text(name, value)
-            rows.append([text(group), text(label), text(shown)])
-    if not rows:
-        return ""
-    return "<h3>Scores</h3>" + table(["Metric", "", "Value"], rows, numbers=[2])
+        words = [value_text(name, value) for name, value in values.items()]
+        rows = [[text(label), text(shown)] for label, shown in words]
+        groups.append(f"<div><h3>{text(group)}</h3>{table([], rows, numbers=[1])}</div>")
+    return f'<div class="columns">{"".join(groups)}</div>' if groups else ""
 
 
 def _features(report: Report) -> str:

@@ -109,18 +109,8 @@ def _limits(ax: Axes, total: NDArray[np.float64], t: NDArray[np.float64]) -> Non
     period = 1000.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     if 0 < period < 3.0 * usual:
         top = max(top, 1.15 * period)
-        ax.axhline(period, color=PALETTE["ink"], lw=1.0, ls=(0, (4, 3)))
-        note = f"camera period {period:.0f} ms"
-        ax.annotate(
-            note,
-            (1, period),
-            (-3, 3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            fontsize=8,
-            color=PALETTE["ink"],
-        )
+        style = {"color": PALETTE["ink"], "lw": 1.0, "ls": (0, (4, 3))}
+        ax.axhline(period, label=f"camera period {period:.0f} ms", **style)  # type: ignore[arg-type]
     if clipped:
         at = t[int(np.argmax(total))]
         ax.annotate(f"{most:.0f} ms ↑", (at, top), (3, -10), textcoords="offset points",

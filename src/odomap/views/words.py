@@ -19,6 +19,14 @@ UNITS = {
     "_s": "s",
     "ms_per_frame": "ms",
 }
+NAMES = {
+    "truth": "poses in truth",
+    "matched": "poses matched",
+    "rmse_pct_of_path": "rmse",
+    "path_m": "length of path",
+    "ms_per_frame": "time per frame,",
+    "skipped": "images skipped",
+}
 CARDS = {
     "real_time_factor": "times real time",
     "keyframes": "keyframes",
@@ -50,10 +58,9 @@ def value_text(name: str, value: object) -> tuple[str, str]:
     for k in reversed(range(len(words))):
         end = next((e for e in UNITS if words[k].endswith(e)), None)
         if end is not None:
-            kept = words[k] if words[k] == end else words[k].removesuffix(end)
-            words[k] = kept
+            words[k] = NAMES.get(words[k], words[k].removesuffix(end))
             return " ".join(words).replace("_", " "), _with_unit(value, UNITS[end])
-    return name.replace("_", " "), _with_unit(value, "")
+    return NAMES.get(name, name).replace("_", " "), _with_unit(value, "")
 
 
 def _with_unit(value: object, unit: str) -> str:
