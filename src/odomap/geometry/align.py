@@ -39,7 +39,7 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = False) -> S
 
     Example:
         >>> points = np.eye(3)
-        >>> umeyama(points, 2.0 * points, with_scale=True).scale
+        >>> round(umeyama(points, 2.0 * points, with_scale=True).scale, 9)
         2.0
     """
     x, y = _pairs(source, target)

@@ -43,23 +43,27 @@ def radtan_distort(x: float, y: float, d: Array) -> tuple[float, float, float, f
 def radtan_undistort(xd: float, yd: float, d: Array, reach: float) -> tuple[float, float]:
     """Solve distort(x, y) = (xd, yd) by Newton's method; NaN if there is no solution in reach.
 
-    (x, y) += [[a, b], [b, c]]⁻¹ (missing), at most half a unit at a time; where the slope is near
-    singular, half of what is missing. `reach` bounds x² + y².
+    (x, y) += [[a, b], [b, c]]⁻¹ (missing), at most half a unit at a time and halved until it stays
+    within x² + y² < reach, where the lens is one-to-one.
     """
     x, y = xd, yd
     for _ in range(40):
         px, py, a, b, c = radtan_distort(x, y, d)
         ex, ey = xd - px, yd - py
         det = a * c - b * b
-        if det > 0.05:
+        if det > 1e-9:
             sx, sy = (c * ex - b * ey) / det, (a * ey - b * ex) / det
         else:
             sx, sy = 0.5 * ex, 0.5 * ey
         length = np.sqrt(sx * sx + sy * sy)
         shrink = 1.0 if length <= 0.5 else 0.5 / length
+        for _ in range(20):
+            if (x + shrink * sx) ** 2 + (y + shrink * sy) ** 2 < reach:
+                break
+            shrink *= 0.5
         x += shrink * sx
         y += shrink * sy
-        if length < 1e-9:
+        if shrink * length < 1e-9:
             # Newton squares the error: after this step it is below rounding.
             break
     px, py, a, b, c = radtan_distort(x, y, d)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from odomap.kernels import kernel
 
 __all__ = [
+    "half_cot",
     "se3_compose_into",
     "se3_exp_into",
     "se3_inverse_into",
@@ -40,17 +41,27 @@ Array = NDArray[np.float64]
 def stumpff_123(x: float) -> tuple[float, float, float]:
     """c₁, c₂, c₃ at x = θ²: c_k = Σ (-x)^m / (2m+k)!; the series below θ = 0.5."""
     if x < 0.25:
-        c1 = 1.0 - x / 6.0 * (1.0 - x / 20.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0)))
-        c2 = 0.5 - x / 24.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0 * (1.0 - x / 90.0)))
-        c3 = 1.0 - x / 20.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * (1.0 - x / 110.0)))
-        high = x * x * x * x * x
-        c1 -= high / 39916800.0
-        c2 -= high / 479001600.0
-        return c1, c2, (c3 - 6.0 * high / 6227020800.0) / 6.0
+        c1 = 1.0 - x / 110.0 * (1.0 - x / 156.0 * (1.0 - x / 210.0))
+        c1 = 1.0 - x / 6.0 * (1.0 - x / 20.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * c1)))
+        c2 = 1.0 - x / 132.0 * (1.0 - x / 182.0 * (1.0 - x / 240.0))
+        c2 = 1.0 - x / 12.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0 * (1.0 - x / 90.0 * c2)))
+        c3 = 1.0 - x / 156.0 * (1.0 - x / 210.0 * (1.0 - x / 272.0))
+        c3 = 1.0 - x / 20.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * (1.0 - x / 110.0 * c3)))
+        return c1, c2 / 2.0, c3 / 6.0
     theta = np.sqrt(x)
     half = np.sin(0.5 * theta)
     c1 = np.sin(theta) / theta
     return c1, 2.0 * half * half / x, (1.0 - c1) / x
+
+
+@kernel
+def half_cot(x: float) -> float:
+    """(1 - θ/2 cot θ/2) / θ² at x = θ²; the series below θ = 0.2."""
+    if x < 0.04:
+        d = 1.0 / 1209600.0 + x * (1.0 / 47900160.0 + x * 691.0 / 1307674368000.0)
+        return 1.0 / 12.0 + x * (1.0 / 720.0 + x * (1.0 / 30240.0 + x * d))
+    half = 0.5 * np.sqrt(x)
+    return float((1.0 - half * np.cos(half) / np.sin(half)) / x)
 
 
 @kernel
@@ -86,12 +97,7 @@ def so3_right_jacobian_into(phi: Array, J: Array) -> None:
 def so3_left_jacobian_inverse_into(phi: Array, J: Array) -> None:
     """J = I - φ^/2 + d φ^², d = (1 - θ/2 cot θ/2) / θ²."""
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    if x < 0.04:
-        d = 1.0 / 12.0 + x * (1.0 / 720.0 + x * (1.0 / 30240.0 + x * (1.0 / 1209600.0)))
-        d += x * x * x * x / 47900160.0
-    else:
-        half = 0.5 * np.sqrt(x)
-        d = (1.0 - half * np.cos(half) / np.sin(half)) / x
+    d = half_cot(x)
     _rotation_series(phi, -0.5, d, J)
 
 
@@ -154,11 +160,7 @@ def se3_log_into(R: Array, t: Array, xi: Array) -> None:
     so3_log_into(R, phi)
     x, y, z = phi[0], phi[1], phi[2]
     s = x * x + y * y + z * z
-    if s < 0.04:
-        d = 1.0 / 12.0 + s * (1.0 / 720.0 + s * (1.0 / 30240.0 + s * (1.0 / 1209600.0)))
-    else:
-        half = 0.5 * np.sqrt(s)
-        d = (1.0 - half * np.cos(half) / np.sin(half)) / s
+    d = half_cot(s)
     a, b, c = y * t[2] - z * t[1], z * t[0] - x * t[2], x * t[1] - y * t[0]
     xi[0] = t[0] - 0.5 * a + d * (y * c - z * b)
     xi[1] = t[1] - 0.5 * b + d * (z * a - x * c)

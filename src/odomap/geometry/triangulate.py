@@ -1,0 +1,151 @@
+"""Triangulation: where a point is that several cameras saw.
+
+The problem: the rays of one point never quite meet. The point nearest to all of them is linear,
+
+    Σ (I - b bᵀ) (p - c) = 0        c a camera's centre, b its unit ray, world axes
+
+and Gauss-Newton from there minimises the reprojection error Σ |π(T_camera_world p) - x|² on the
+plane z = 1, which is what the noise is about. How well the depth is known depends on the parallax,
+the widest angle between two rays: below a degree a point is a direction. All points at once:
+O(views · points).
+
+Reference: R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., Cambridge
+University Press 2004, chapter 12.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from odomap.errors import InputError
+from odomap.geometry.lie import se3_inverse
+from odomap.geometry.so3 import Array, tail_shape
+
+__all__ = ["Triangulation", "parallax", "triangulate"]
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points and what speaks for them.
+
+    Attributes:
+        points_world: (N, 3) metres, NaN where fewer than two views saw the point.
+        parallax: (N,) widest angle between two rays to the point, rad; 0 where there is no point.
+        errors: (N,) root mean square reprojection error over the views, on the plane z = 1.
+        ahead: (N,) bool, the point lies in front of every camera that saw it.
+    """
+
+    points_world: Array
+    parallax: Array
+    errors: Array
+    ahead: NDArray[np.bool_]
+
+
+def triangulate(
+    Ts_world_camera: ArrayLike, normalised: ArrayLike, iterations: int = 5
+) -> Triangulation:
+    """Find points from where several cameras saw them.
+
+    Args:
+        Ts_world_camera: (V, 4, 4) poses of the cameras, V ≥ 2.
+        normalised: (V, N, 2) x/z, y/z as `Camera.undistort` gives them; NaN where not seen.
+        iterations: Gauss-Newton steps.
+
+    Returns:
+        The points, with parallax, error, and whether they lie ahead.
+
+    Raises:
+        InputError: shapes do not agree.
+
+    Example:
+        >>> Ts = np.tile(np.eye(4), (2, 1, 1)); Ts[1, 0, 3] = 1.0
+        >>> triangulate(Ts, [[[0.0, 0.0]], [[-0.5, 0.0]]]).points_world.round(6) + 0.0
+        array([[0., 0., 2.]])
+    """
+    poses = tail_shape(Ts_world_camera, (4, 4), "Ts_world_camera")
+    seen_at = tail_shape(normalised, (2,), "normalised")
+    if poses.ndim != 3 or len(poses) < 2 or seen_at.ndim != 3 or len(seen_at) != len(poses):
+        raise InputError(
+            f"Ts_world_camera, normalised: shapes {poses.shape}, {seen_at.shape}, "
+            "give (V, 4, 4), (V, N, 2) with V ≥ 2"
+        )
+    seen: NDArray[np.bool_] = np.all(np.isfinite(seen_at), axis=2)
+    enough = np.count_nonzero(seen, axis=0) >= 2
+    x = np.where(seen[..., None], seen_at, 0.0)
+    weight: Array = seen.astype(np.float64)
+    points = _nearest_to_rays(poses, x, weight)
+    views = se3_inverse(poses)
+    cost = _linearised(views, x, weight, points)[0]
+    damping = np.full(points.shape[0], 1e-6)
+    for _ in range(iterations):
+        _, H, g = _linearised(views, x, weight, points)
+        H = H + damping[:, None, None] * (np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3))
+        H[~np.isfinite(H).all(axis=(1, 2)) | (np.linalg.det(H) == 0)] = np.eye(3)
+        moved = points - np.linalg.solve(H, g[..., None])[..., 0]
+        new_cost = _linearised(views, x, weight, moved)[0]
+        better = new_cost <= cost
+        points = np.where(better[:, None], moved, points)
+        cost = np.where(better, new_cost, cost)
+        damping = np.where(better, 0.1 * damping, 1e3 * damping)
+    depth = np.einsum("vj,nj->vn", views[:, 2, :3], points) + views[:, 2, 3, None]
+    count = np.maximum(np.count_nonzero(seen, axis=0), 1)
+    ahead = enough & np.all(~seen | (depth > 0), axis=0)
+    angles = np.where(enough, _widest_angle(poses[:, :3, 3], points, seen), 0.0)
+    return Triangulation(
+        np.where(enough[:, None], points, np.nan), angles, np.sqrt(cost / count), ahead
+    )
+
+
+def parallax(centres: ArrayLike, points: ArrayLike) -> Array:
+    """Return the widest angle under which points see the cameras.
+
+    Args:
+        centres: (V, 3) camera centres, metres.
+        points: (N, 3) metres, same frame.
+
+    Returns:
+        (N,) rad.
+    """
+    c, p = tail_shape(centres, (3,), "centres"), tail_shape(points, (3,), "points")
+    if c.ndim != 2 or p.ndim != 2:
+        raise InputError(f"centres, points: shapes {c.shape}, {p.shape}, give (V, 3), (N, 3)")
+    return _widest_angle(c, p, np.ones((len(c), len(p)), dtype=np.bool_))
+
+
+def _widest_angle(centres: Array, points: Array, seen: NDArray[np.bool_]) -> Array:
+    """The angle by atan2 of cross and dot product, which is exact for small ones."""
+    rays = points[None] - centres[:, None]
+    widest = np.zeros(len(points))
+    for i in range(len(centres)):
+        for j in range(i + 1, len(centres)):
+            cross = np.linalg.norm(np.cross(rays[i], rays[j]), axis=1)
+            angle = np.arctan2(cross, np.sum(rays[i] * rays[j], axis=1))
+            widest = np.where(seen[i] & seen[j], np.fmax(widest, angle), widest)
+    return widest
+
+
+def _nearest_to_rays(poses: Array, x: Array, weight: Array) -> Array:
+    """Solve Σ w (I - b bᵀ)(p - c) = 0 for each point."""
+    rays = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    b = np.einsum("vij,vnj->vni", poses[:, :3, :3], rays)
+    across = weight[..., None, None] * (np.eye(3) - b[..., :, None] * b[..., None, :])
+    A = np.sum(across, axis=0)
+    y = np.einsum("vnij,vj->ni", across, poses[:, :3, 3])
+    # Parallel rays meet nowhere: a touch of damping puts their point far out, not at infinity.
+    A += 1e-12 * np.maximum(np.trace(A, axis1=1, axis2=2), 1.0)[:, None, None] * np.eye(3)
+    return np.asarray(np.linalg.solve(A, y[..., None])[..., 0])
+
+
+def _linearised(views: Array, x: Array, weight: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Return Σ w |r|², JᵀJ and Jᵀr of every point; infinite cost behind a camera."""
+    R, t = views[:, :3, :3], views[:, :3, 3]
+    p = np.einsum("vij,nj->vni", R, points) + t[:, None]
+    behind = np.any((weight > 0) & (p[..., 2] <= 0), axis=0)
+    z = np.where(p[..., 2] > 0, p[..., 2], 1.0)
+    uv = p[..., :2] / z[..., None]
+    r = weight[..., None] * (uv - x)
+    J = (R[:, None, :2, :] - uv[..., None] * R[:, None, 2:, :]) * (weight / z)[..., None, None]
+    cost = np.where(behind, np.inf, np.sum(r * r, axis=(0, 2)))
+    return cost, np.einsum("vnki,vnkj->nij", J, J), np.einsum("vnki,vnk->ni", J, r)
