@@ -125,8 +125,7 @@ class Outputs:
                 failures.append(error)
             else:
                 self.written += (name,)
-                if name == "trajectory_live.tum":
-                    self._part.unlink(missing_ok=True)
+                self._forget_live()  # the path is safe: give its space to the other files
         if failures:
             there = f"written: {', '.join(self.written)}" if self.written else "nothing is written"
             raise OutputError(f"{failures[0]}; {there}")

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any
 
-from odomap.errors import ConfigError, InputError
+from odomap.errors import CalibrationError, ConfigError, InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.logbook import Logbook, skipped_numbers, versions
 from odomap.maps.estimate import Estimate
@@ -141,34 +141,22 @@ def run(
         raise ConfigError(f"rhythm '{rhythm}' does not exist in this version: use 'inline'")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
-    tell = progress or (lambda _: None)
     settings = chosen_config(preset, config)
     source = data if isinstance(data, Source) else _opened(data, rig)
-    name = data if isinstance(data, str | Path) else source.name
-    head = {"data": str(name)} | ({"preset": preset} if preset else {}) | dict(origin or {})
+    head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
+    head |= ({"preset": preset} if preset else {}) | dict(origin or {})
     outputs = Outputs(out, settings, head) if out is not None else None
 
+    tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
     logbook = Logbook(min(len(source), max_frames or len(source)))
     with _deferred_interrupt() as interrupt:
-        result = _track(source, settings, logbook, outputs, max_frames, tell, interrupt)
-    metrics, warnings = _metrics(source, logbook, result)
-    metrics["compile_s"] = compile_s
-    metrics["interrupted"] = interrupt.is_set()
-    if outputs is not None:
-        tell(Progress("writing", 0, 0))
-        outputs.write(source, result, logbook, metrics, warnings)
-    finished = RunResult(
-        trajectory=result.trajectory,
-        trajectory_live=result.trajectory_live,
-        map=result.map,
-        estimates=tuple(logbook.estimates),
-        metrics=metrics,
-        out=outputs.folder if outputs else None,
-        written=outputs.written if outputs else (),
-        failure=metrics["failure"],
-        warnings=tuple(warnings),
-    )
+        try:
+            result = _track(source, settings, logbook, outputs, max_frames, tell, interrupt)
+        except CalibrationError as error:  # found while tracking: say of which recording
+            raise CalibrationError(f"{head['data']}: {error}") from error
+        state = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
+        finished = _concluded(source, logbook, result, outputs, state, tell)
     if interrupt.is_set():
         raise Interrupted(finished)
     return finished
@@ -215,8 +203,9 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
     from odomap.kernels import modules_with_kernels, warm_up
 
     start = time.perf_counter()
+    imported = set(sys.modules)  # looking for kernels imports packages
     geometry = "odomap.geometry."
-    names = [n for n in modules_with_kernels() if n in sys.modules or n.startswith(geometry)]
+    names = [n for n in modules_with_kernels() if n in imported or n.startswith(geometry)]
     for index, name in enumerate(names):
         tell(Progress("compiling", index, len(names), text=name))
         warm_up(name)
@@ -248,6 +237,33 @@ def _track(
         if interrupt.is_set() or done == max_frames:
             break
     return system.finish()
+
+
+def _concluded(
+    source: "Source",
+    logbook: Logbook,
+    result: "Result",
+    outputs: "Outputs | None",
+    state: Mapping[str, object],
+    tell: Callable[[Progress], None],
+) -> RunResult:
+    """Make the numbers, write what is asked for."""
+    metrics, warnings = _metrics(source, logbook, result)
+    metrics |= state
+    if outputs is not None:
+        tell(Progress("writing", 0, 0))
+        outputs.write(source, result, logbook, metrics, warnings)
+    return RunResult(
+        trajectory=result.trajectory,
+        trajectory_live=result.trajectory_live,
+        map=result.map,
+        estimates=tuple(logbook.estimates),
+        metrics=metrics,
+        out=outputs.folder if outputs else None,
+        written=outputs.written if outputs else (),
+        failure=metrics["failure"],
+        warnings=tuple(warnings),
+    )
 
 
 @contextmanager
@@ -293,10 +309,9 @@ def _metrics(
             metrics["ate_rmse_m"] = found.rmse
             metrics["ate"] = found.as_dict()
     if metrics["skipped"]:
-        first = source.skipped[0]
-        warnings.append(
-            f"{metrics['skipped']} measurements skipped, the first: {first.file}: {first.reason}"
-        )
+        first, count = source.skipped[0], metrics["skipped"]
+        what = "1 measurement" if count == 1 else f"{count} measurements, the first"
+        warnings.append(f"skipped {what}: {first.file}: {first.reason}")
     for frame_id, seconds in logbook.gaps():
         warnings.append(f"a gap of {seconds:.2f} s after frame {frame_id}")
     if metrics["lost"] and not metrics["failure"]:

@@ -31,7 +31,7 @@ VERBS: dict[str, Any] = {
     "doctor": Doctor,
 }
 
-TAKES_OVERRIDES = {"run", "demo", "config"}
+TAKES_OVERRIDES = frozenset({"run", "demo", "config"})
 """Verbs that accept --section.field VALUE for any field of the config."""
 
 DESCRIPTION = """SLAM in Python.

@@ -1,0 +1,241 @@
+"""One call from a recording to its results, as a program uses it."""
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+import odomap
+from odomap.errors import CalibrationError, ConfigError, InputError, OutputError
+from odomap.files.trajectories import read_tum
+from odomap.geometry.pose import SE3
+from odomap.logbook import Logbook, peak_memory_mb, spread
+from odomap.maps.estimate import Estimate, Status
+from odomap.outputs import as_json
+from odomap.run import Interrupted, Progress, run
+from odomap.sensors.frame import Frame
+from odomap.sources.open import open as open_source
+from odomap.sources.source import Skipped
+
+WORLD = "sim:room?seed=3&frames=12"
+
+
+class Stopping:
+    """A source that presses Ctrl-C while it hands out a frame."""
+
+    def __init__(self, source, after):
+        self._source, self._after = source, after
+        self.name, self.rig, self.truth = source.name, source.rig, source.truth
+        self.skipped = []
+
+    def __len__(self):
+        return len(self._source)
+
+    def __iter__(self):
+        import signal
+
+        for frame in self._source:
+            if frame.id == self._after:
+                signal.raise_signal(signal.SIGINT)
+            yield frame
+
+
+class Edited(Stopping):
+    """A source whose frames go through a function; None leaves a frame out."""
+
+    def __iter__(self):
+        for frame in self._source:
+            edited = self._after(frame)
+            if edited is None:
+                self.skipped.append(Skipped(frame.stamp_ns, f"{frame.id}.png", "truncated"))
+            else:
+                yield edited
+
+
+@pytest.fixture(scope="module")
+def world():
+    return open_source(WORLD)
+
+
+@pytest.fixture(scope="module")
+def result(world, tmp_path_factory):
+    return run(world, tmp_path_factory.mktemp("out"))
+
+
+def test_result_has_a_path_and_its_numbers(result, world):
+    assert result.failure == ""
+    assert len(result.trajectory) == len(result.trajectory_live) == 12
+    assert len(result.estimates) == 12
+    assert all(estimate.tracks is None for estimate in result.estimates)
+    m = result.metrics
+    assert (m["frames"], m["tracked"], m["lost"]) == (12, 12, 0)
+    assert m["statuses"]["lost"] == 0
+    assert m["keyframes"] >= 1
+    assert m["landmarks"] > 50
+    assert m["duration_s"] == pytest.approx(world.truth.duration_s, abs=1e-6)
+    assert m["ate_rmse_m"] == pytest.approx(odomap.ate(result.trajectory, world.truth).rmse)
+    assert m["ate_rmse_m"] < 0.01
+    assert set(m["versions"]) >= {"odomap", "python", "numpy", "numba"}
+
+
+def test_folder_holds_what_the_result_says(result):
+    assert result.out is not None
+    assert set(result.written) == {path.name for path in result.out.iterdir()}
+    assert json.loads((result.out / "metrics.json").read_text())["frames"] == 12
+    np.testing.assert_allclose(
+        read_tum(result.out / "trajectory.tum").positions, result.trajectory.positions, atol=1e-9
+    )
+    html = (result.out / "report.html").read_text()
+    assert "<svg" in html or "<img" in html
+
+
+def test_same_input_gives_the_same_bytes(result, tmp_path):
+    again = run(WORLD, tmp_path)
+    for name in ("trajectory.tum", "trajectory_live.tum"):
+        assert (again.out / name).read_bytes() == (result.out / name).read_bytes()
+
+
+def test_without_a_folder_nothing_is_written(world, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = run(world, max_frames=3)
+    assert found.metrics["frames"] == 3
+    assert found.out is None
+    assert found.written == ()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_tells_stages_and_frames(world):
+    told: list[Progress] = []
+    run(world, max_frames=3, progress=told.append)
+    stages = list(dict.fromkeys(p.stage for p in told))
+    assert stages == ["compiling", "tracking"]
+    tracking = [p for p in told if p.stage == "tracking"]
+    assert [(p.done, p.total) for p in tracking] == [(1, 3), (2, 3), (3, 3)]
+    assert all(p.estimate is not None for p in tracking)
+
+
+def test_interrupt_ends_after_the_frame_at_hand_and_writes(world, tmp_path):
+    with pytest.raises(Interrupted) as stop:
+        run(Stopping(world, after=5), tmp_path)
+    result = stop.value.result
+    assert isinstance(stop.value, KeyboardInterrupt)
+    assert result.metrics["interrupted"] is True
+    assert result.metrics["frames"] == 6
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 6
+    assert (tmp_path / "report.html").exists()
+
+
+def test_runs_in_a_thread_without_touching_signals(world):
+    found = []
+    thread = threading.Thread(target=lambda: found.append(run(world, max_frames=2)))
+    thread.start()
+    thread.join()
+    assert found[0].metrics["frames"] == 2
+
+
+def test_skipped_frames_are_counted_and_named(world, tmp_path):
+    source = Edited(world, lambda frame: None if frame.id == 4 else frame)
+    result = run(source, tmp_path)
+    assert result.metrics["frames"] == 11
+    assert result.metrics["skipped"] == 1
+    assert result.metrics["skipped_measurements"][0]["file"] == "4.png"
+    assert any("4.png: truncated" in warning for warning in result.warnings)
+
+
+def test_a_gap_is_a_warning(world):
+    def late(frame):
+        shift = 2_000_000_000 if frame.id > 6 else 0
+        return Frame(frame.id, frame.stamp_ns + shift, frame.images)
+
+    result = run(Edited(world, late))
+    assert any("a gap of 2.05 s after frame 6" in warning for warning in result.warnings)
+
+
+def test_black_frames_are_lost_and_fail_the_run(world, tmp_path):
+    def blank(frame):
+        black = tuple(np.zeros_like(image) for image in frame.images)
+        return frame if frame.id < 2 else Frame(frame.id, frame.stamp_ns, black)
+
+    result = run(Edited(world, blank), tmp_path)
+    assert result.metrics["lost"] == 10
+    assert "2 of 12 frames have a pose" in result.failure
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 2
+
+
+def test_a_source_without_frames_fails_with_a_reason(world, tmp_path):
+    result = run(Edited(world, lambda frame: None), tmp_path)
+    assert result.failure == "no frame could be read"
+    assert (tmp_path / "report.html").exists()
+    assert (tmp_path / "trajectory.tum").exists()
+
+
+def test_config_changes_the_run(world, tmp_path):
+    (tmp_path / "c.yaml").write_text("features: {count: 150}\n")
+    few = run(world, config=tmp_path / "c.yaml", max_frames=4)
+    many = run(world, max_frames=4)
+    assert few.metrics["landmarks"] < many.metrics["landmarks"]
+
+
+def test_refusals(world, tmp_path):
+    with pytest.raises(ConfigError, match="rhythm 'live'"):
+        run(world, rhythm="live")
+    with pytest.raises(ConfigError, match="did you mean 'stereo'"):
+        run(world, preset="streo")
+    with pytest.raises(InputError, match="max_frames"):
+        run(world, max_frames=0)
+    with pytest.raises(InputError, match="does not exist"):
+        run(tmp_path / "nothing")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        run(world, tmp_path / "file")
+
+
+def test_a_rig_without_a_pair_names_the_recording(world, tmp_path):
+    class Single(Stopping):
+        pass
+
+    from dataclasses import replace
+
+    source = Single(world, after=-1)
+    source.rig = replace(world.rig, cameras=world.rig.cameras[:1])
+    with pytest.raises(CalibrationError, match="^sim:room.*stereo needs two cameras"):
+        run(source)
+
+
+def estimate(k, status=Status.TRACKING, keyframe_id=0):
+    pose = SE3.identity()
+    return Estimate(k, 10**9 * k, status, "dark", keyframe_id, pose, pose, np.eye(6))
+
+
+def test_logbook_keeps_a_few_frames_only():
+    book = Logbook(1000)
+    frame = Frame(0, 0, (np.zeros((4, 4), np.uint8),))
+    for k in range(1000):
+        book.add(frame, estimate(k), 0.01)
+    assert len(book.samples) == 6
+    assert book.samples[0][1].frame_id == 0
+    assert book.samples[-1][1].frame_id == 999
+    assert book.frames_per_second == pytest.approx(100.0)
+
+
+def test_logbook_counts_what_has_a_pose():
+    book = Logbook(4)
+    frame = Frame(0, 0)
+    for k, (status, keyframe) in enumerate(
+        [(Status.INITIALIZING, -1), (Status.TRACKING, 0), (Status.LOST, 0), (Status.LOST, 0)]
+    ):
+        book.add(frame, estimate(k, status, keyframe), 0.01)
+    assert book.placed == 1
+    assert book.failure() == "tracking was lost, 1 of 4 frames have a pose: dark"
+
+
+def test_numbers_that_are_not_finite_become_null():
+    text = as_json({"a": float("nan"), "b": [float("inf"), 1.0], "c": {"d": -0.5}})
+    assert json.loads(text) == {"a": None, "b": [None, 1.0], "c": {"d": -0.5}}
+
+
+def test_spread_and_memory():
+    assert spread([1.0, 2.0, 9.0])["median"] == 2.0
+    assert spread([])["p95"] == 0.0
+    assert 20 < peak_memory_mb() < 1e5
