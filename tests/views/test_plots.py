@@ -94,6 +94,27 @@ def test_camera_axes_are_drawn_with_up_upwards() -> None:
     assert side.yaxis_inverted()
 
 
+def test_a_straight_road_keeps_its_heights_apart() -> None:
+    """Sideways and up differ little on a straight road; the direction of travel tells."""
+    Ts = np.tile(np.eye(4), (40, 1, 1))
+    s = np.arange(40.0)
+    Ts[:, :3, 3] = np.c_[-0.02 * s, -0.03 * s, 1.5 * s]
+    place = scene(Trajectory(np.arange(40, dtype=np.int64) * 10**8, Ts), None)
+    assert place is not None
+    assert (place.up_axis, place.up_sign) == (1, -1.0)
+
+
+def test_a_world_with_gravity_has_z_up(report: Report) -> None:
+    """Also where a drone climbs: the camera's first pose is not the world's."""
+    assert report.truth is not None
+    Ts = report.truth.Ts_world_body.copy()
+    Ts[:, 2, 3] *= 20
+    Ts[:, 1, 3] *= 0.01
+    place = scene(Trajectory(report.truth.stamps_ns, Ts), None)
+    assert place is not None
+    assert (place.up_axis, place.up_sign) == (2, 1.0)
+
+
 def test_errors_lie_inside_the_band_they_claim(report: Report) -> None:
     figure = error_figure(report.trajectory, report.truth)
     assert len(figure.axes) == 6

@@ -111,7 +111,7 @@
     ctx.fillStyle = palette.keyframe;
     for (const i of data.keyframes) {
       const [u, v] = project(path[3 * i], path[3 * i + 1], path[3 * i + 2]);
-      ctx.beginPath(); ctx.arc(u, v, 2.4, 0, 7); ctx.fill();
+      ctx.beginPath(); ctx.arc(u, v, 1.9, 0, 7); ctx.fill();
     }
   };
   const drawBody = () => {

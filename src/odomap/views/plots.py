@@ -112,7 +112,7 @@ def _draw_path(
         at = np.isin(place.stamps_ns, keyframes).nonzero()[0]
         at = at[thin(len(at), 300)]
         k = place.positions[at]
-        style = {"marker": "o", "ms": 2.6, "ls": "", "color": PALETTE["keyframe"]}
+        style = {"marker": "o", "ms": 2.0, "ls": "", "color": PALETTE["keyframe"]}
         ax.plot(k[:, a], k[:, b], label="keyframe", zorder=3, **style)  # type: ignore[arg-type]
     ink = PALETTE["ink"]
     for index, marker, label in ((0, "o", "start"), (-1, "s", "end")):
@@ -178,7 +178,7 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
     if error is None:
         return _uncertainty(trajectory)
     figure = new_figure(9.6, 5.0)
-    grid = figure.subplots(3, 2, sharex=True, gridspec_kw={"wspace": 0.12, "hspace": 0.12})
+    grid = figure.subplots(3, 2, sharex=True, gridspec_kw={"wspace": 0.2, "hspace": 0.12})
     keep = thin(len(error.index), ERROR_POINTS)
     stamps = error.stamps_ns[keep]
     t = (stamps - stamps[0]) * 1e-9
@@ -194,8 +194,8 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
             line = gaps_as_nan(stamps, factor * values[:, k])
             ax.axhline(0.0, color=PALETTE["muted"], lw=0.6)
             ax.plot(t, line, color=PALETTE["estimate"], lw=1.3, label="error")
-            name = {"fontsize": 9, "fontweight": "bold", "color": PALETTE["muted"]}
-            ax.text(0.015, 0.84, AXES[k], transform=ax.transAxes, **name)  # type: ignore[arg-type]
+            ax.set_ylabel(AXES[k], rotation=0, fontsize=9, color=PALETTE["muted"])
+            ax.yaxis.set_label_coords(-0.12, 0.45)
             ax.margins(x=0.01)
         grid[2, column].set_xlabel("time [s]")
     legend(grid[0, 1])

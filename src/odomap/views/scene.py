@@ -1,7 +1,7 @@
 """What plots of a path share: which way is up, how much to draw, which unit to write.
 
-A world frame may have gravity along −z, or be the first camera with y down: where a path is flat
-its thin direction tells; where it is not, z is taken as up.
+A world frame has gravity along −z, unless it is the first camera itself, with y down: then the
+first pose is the identity, and the path runs along z, or hardly along y.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,9 @@ __all__ = ["AXES", "Scene", "gaps_as_nan", "scene", "thin", "unit_of"]
 AXES = "xyz"
 FLAT = 0.3
 """A path whose least extent is below this share of its middle one is flat."""
+
+SAME_AXES = 2.9
+"""Trace of a rotation from which on (18°) the first pose counts as the identity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,24 +64,27 @@ def scene(trajectory: Trajectory | None, truth: Trajectory | None) -> Scene | No
     true: NDArray[np.float64] | None = None
     distances: NDArray[np.float64] | None = None
     T = np.eye(4)
+    R_first = Ts[0, :3, :3]
     if error is not None and truth is not None:
         T = error.T_truth_estimate.matrix
         Ts = T @ Ts
-        true = truth.positions[finite_part(truth)]
-        seen = (truth.stamps_ns >= stamps[0]) & (truth.stamps_ns <= stamps[-1])
-        true = true[seen[finite_part(truth)]] if seen.any() else true
+        true = truth.between(int(stamps[0]), int(stamps[-1])).positions
+        # The truth's own rotation: a straight path leaves the roll of the alignment open.
+        R_first = truth.Ts_world_body[0, :3, :3]
         at = stamps.astype(np.float64) - float(stamps[0])
         known = error.stamps_ns.astype(np.float64) - float(stamps[0])
         distances = np.interp(at, known, error.distances)
     positions = np.ascontiguousarray(Ts[:, :3, 3])
-    axis, sign = _up(positions)
+    axis, sign = _up(positions, R_first)
     return Scene(stamps, positions, Ts[:, :3, :3], true, distances, axis, sign, T)
 
 
-def _up(positions: NDArray[np.float64]) -> tuple[int, float]:
+def _up(positions: NDArray[np.float64], R_first: NDArray[np.float64]) -> tuple[int, float]:
     extents = np.ptp(positions, axis=0)
-    least, middle, _ = np.sort(extents)
-    if middle > 0 and least < FLAT * middle and extents[1] == least:
+    least, middle, most = np.sort(extents)
+    flat_in_y = middle > 0 and least < FLAT * middle and extents[1] == least
+    along_z = most > 0 and extents[2] == most
+    if np.trace(R_first) > SAME_AXES and (flat_in_y or along_z):
         return 1, -1.0
     return 2, 1.0
 
