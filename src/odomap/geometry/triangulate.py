@@ -24,15 +24,20 @@ from odomap.geometry.so3 import Array, tail_shape
 
 __all__ = ["Triangulation", "parallax", "triangulate"]
 
+_PARALLEL = 1e-6
+"""Radians between two rays below which they have no point in common."""
+
 
 @dataclass(frozen=True)
 class Triangulation:
     """Points and what speaks for them.
 
     Attributes:
-        points_world: (N, 3) metres, NaN where fewer than two views saw the point.
-        parallax: (N,) widest angle between two rays to the point, rad; 0 where there is no point.
-        errors: (N,) root mean square reprojection error over the views, on the plane z = 1.
+        points_world: (N, 3) metres, NaN where fewer than two views saw the point, or along rays
+            that are parallel to a millionth of a radian.
+        parallax: (N,) widest angle between two observed rays, rad; 0 where fewer than two saw it.
+        errors: (N,) root mean square reprojection error over the views, on the plane z = 1;
+            infinite behind a camera.
         ahead: (N,) bool, the point lies in front of every camera that saw it.
     """
 
@@ -71,11 +76,26 @@ def triangulate(
             "give (V, 4, 4), (V, N, 2) with V ≥ 2"
         )
     seen: NDArray[np.bool_] = np.all(np.isfinite(seen_at), axis=2)
-    enough = np.count_nonzero(seen, axis=0) >= 2
     x = np.where(seen[..., None], seen_at, 0.0)
     weight: Array = seen.astype(np.float64)
-    points = _nearest_to_rays(poses, x, weight)
+    rays = np.einsum("vij,vnj->vni", poses[:, :3, :3], np.insert(x, 2, 1.0, axis=2))
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    angles = _widest_angle(rays, seen)
+    enough = angles > _PARALLEL
+    points = _nearest_to_rays(poses[:, :3, 3], rays, np.where(enough, weight, 0.0))
     views = se3_inverse(poses)
+    points, cost = _refined(views, x, weight, points, iterations)
+    depth = np.einsum("vj,nj->vn", views[:, 2, :3], points) + views[:, 2, 3, None]
+    count = np.maximum(np.count_nonzero(seen, axis=0), 1)
+    ahead = enough & np.all(~seen | (depth > 0), axis=0)
+    points = np.where(enough[:, None], points, np.nan)
+    return Triangulation(points, angles, np.sqrt(cost / count), ahead)
+
+
+def _refined(
+    views: Array, x: Array, weight: Array, points: Array, iterations: int
+) -> tuple[Array, Array]:
+    """Take damped Gauss-Newton steps, each point by itself; return the points and their cost."""
     cost = _linearised(views, x, weight, points)[0]
     damping = np.full(points.shape[0], 1e-6)
     for _ in range(iterations):
@@ -84,17 +104,12 @@ def triangulate(
         H[~np.isfinite(H).all(axis=(1, 2)) | (np.linalg.det(H) == 0)] = np.eye(3)
         moved = points - np.linalg.solve(H, g[..., None])[..., 0]
         new_cost = _linearised(views, x, weight, moved)[0]
-        better = new_cost <= cost
+        # Rays that meet behind a camera (infinite cost) are left there: no step makes them true.
+        better = (new_cost <= cost) & np.isfinite(cost)
         points = np.where(better[:, None], moved, points)
         cost = np.where(better, new_cost, cost)
         damping = np.where(better, 0.1 * damping, 1e3 * damping)
-    depth = np.einsum("vj,nj->vn", views[:, 2, :3], points) + views[:, 2, 3, None]
-    count = np.maximum(np.count_nonzero(seen, axis=0), 1)
-    ahead = enough & np.all(~seen | (depth > 0), axis=0)
-    angles = np.where(enough, _widest_angle(poses[:, :3, 3], points, seen), 0.0)
-    return Triangulation(
-        np.where(enough[:, None], points, np.nan), angles, np.sqrt(cost / count), ahead
-    )
+    return points, cost
 
 
 def parallax(centres: ArrayLike, points: ArrayLike) -> Array:
@@ -110,31 +125,26 @@ def parallax(centres: ArrayLike, points: ArrayLike) -> Array:
     c, p = tail_shape(centres, (3,), "centres"), tail_shape(points, (3,), "points")
     if c.ndim != 2 or p.ndim != 2:
         raise InputError(f"centres, points: shapes {c.shape}, {p.shape}, give (V, 3), (N, 3)")
-    return _widest_angle(c, p, np.ones((len(c), len(p)), dtype=np.bool_))
+    return _widest_angle(p[None] - c[:, None], np.ones((len(c), len(p)), dtype=np.bool_))
 
 
-def _widest_angle(centres: Array, points: Array, seen: NDArray[np.bool_]) -> Array:
+def _widest_angle(rays: Array, seen: NDArray[np.bool_]) -> Array:
     """The angle by atan2 of cross and dot product, which is exact for small ones."""
-    rays = points[None] - centres[:, None]
-    widest = np.zeros(len(points))
-    for i in range(len(centres)):
-        for j in range(i + 1, len(centres)):
+    widest = np.zeros(rays.shape[1])
+    for i in range(len(rays)):
+        for j in range(i + 1, len(rays)):
             cross = np.linalg.norm(np.cross(rays[i], rays[j]), axis=1)
             angle = np.arctan2(cross, np.sum(rays[i] * rays[j], axis=1))
             widest = np.where(seen[i] & seen[j], np.fmax(widest, angle), widest)
     return widest
 
 
-def _nearest_to_rays(poses: Array, x: Array, weight: Array) -> Array:
-    """Solve Σ w (I - b bᵀ)(p - c) = 0 for each point."""
-    rays = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    b = np.einsum("vij,vnj->vni", poses[:, :3, :3], rays)
+def _nearest_to_rays(centres: Array, b: Array, weight: Array) -> Array:
+    """Solve Σ w (I - b bᵀ)(p - c) = 0 for each point; those without weight come out as 0."""
     across = weight[..., None, None] * (np.eye(3) - b[..., :, None] * b[..., None, :])
     A = np.sum(across, axis=0)
-    y = np.einsum("vnij,vj->ni", across, poses[:, :3, 3])
-    # Parallel rays meet nowhere: a touch of damping puts their point far out, not at infinity.
-    A += 1e-12 * np.maximum(np.trace(A, axis1=1, axis2=2), 1.0)[:, None, None] * np.eye(3)
+    y = np.einsum("vnij,vj->ni", across, centres)
+    A[~np.any(weight, axis=0)] = np.eye(3)
     return np.asarray(np.linalg.solve(A, y[..., None])[..., 0])
 
 
