@@ -1,8 +1,8 @@
 """The exceptions odomap raises, and what the command line makes of them.
 
-    OdomapError                 every error a user can mend; one line, no traceback on the command line
+    OdomapError                 every error a user can mend: one line, no traceback
     ├── InputError              exit 2: a file, a value or an option is wrong
-    │   ├── CalibrationError    the rig cannot be what it says (missing field, millimetres, swapped pair)
+    │   ├── CalibrationError    the rig cannot be what it says (a field missing, millimetres)
     │   └── ConfigError         an unknown preset, section or field
     ├── MissingExtra            exit 2: an optional library is not installed
     ├── OutputError             exit 1: a result cannot be written (no permission, disk full)
@@ -60,6 +60,6 @@ class TrackingFailed(OdomapError):
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:
-    """Return the known name nearest to a mistyped one as `` (did you mean 'x'?)``, or an empty text."""
+    """Return the known name nearest to a mistyped one, as `` (did you mean 'x'?)``, or nothing."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f" (did you mean '{close[0]}'?)" if close else ""

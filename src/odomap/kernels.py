@@ -12,13 +12,14 @@ through them.
 
 import importlib
 import os
-import pkgutil
 import time
-from collections.abc import Callable, Iterator
-from typing import TypeVar, overload
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar, cast, overload
 
 __all__ = ["clear_cache", "kernel", "modules_with_kernels", "warm_up"]
 
+_PACKAGE = Path(__file__).parent
 F = TypeVar("F", bound=Callable[..., object])
 
 
@@ -38,9 +39,10 @@ def kernel(function: F | None = None, *, reorder: bool = False) -> F | Callable[
     """Compile a function of arrays and scalars: no GIL, cached, IEEE division as NumPy does it.
 
     Args:
-        function: what to compile.
-        reorder: let the compiler change the order of sums, so that it can add several terms at once.
-            Results stay the same from run to run on one machine; NaN and infinity keep their meaning.
+        function: what to compile. reorder: let the compiler change the order of sums, so that it
+        can add several terms at once.
+            Results stay the same from run to run on one machine; NaN and infinity keep their
+            meaning.
     """
 
     def compile_it(inner: F) -> F:
@@ -49,25 +51,19 @@ def kernel(function: F | None = None, *, reorder: bool = False) -> F | Callable[
         import numba
 
         fastmath = {"reassoc", "contract", "nsz", "arcp"} if reorder else False
-        compiled: F = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=fastmath)(
-            inner
-        )
-        return compiled
+        compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=fastmath)
+        return cast(F, compiled(inner))
 
     return compile_it if function is None else compile_it(function)
 
 
-def modules_with_kernels() -> Iterator[str]:
-    """Yield the dotted names of all modules of the package that define `warm_up`, lowest floor first."""
-    import odomap
-
-    for info in sorted(pkgutil.walk_packages(odomap.__path__, "odomap."), key=lambda i: i.name):
-        if info.name.split(".")[-1].startswith("_") or info.name == __name__:
-            continue
-        spec = info.module_finder.find_spec(info.name, None)  # type: ignore[call-arg]
-        source = getattr(spec.loader, "get_source", lambda name: None)(info.name) if spec else None
-        if source and "\ndef warm_up(" in source:
-            yield info.name
+def modules_with_kernels() -> list[str]:
+    """Return the dotted names of all modules of the package that define `warm_up`, in order."""
+    names = []
+    for file in sorted(_PACKAGE.rglob("*.py")):
+        if file != Path(__file__) and "\ndef warm_up(" in file.read_text(encoding="utf-8"):
+            names.append(".".join(("odomap", *file.relative_to(_PACKAGE).with_suffix("").parts)))
+    return names
 
 
 def warm_up(name: str) -> float:
@@ -89,13 +85,7 @@ def clear_cache() -> int:
 
     Numba does not see edits in functions that a cached kernel calls: clear after changing one.
     """
-    import odomap
-
-    removed = 0
-    for folder in odomap.__path__:
-        for root, _, names in os.walk(folder):
-            for name in names:
-                if name.endswith((".nbi", ".nbc")):
-                    os.remove(os.path.join(root, name))
-                    removed += 1
-    return removed
+    files = [f for f in _PACKAGE.rglob("*") if f.suffix in (".nbi", ".nbc")]
+    for file in files:
+        file.unlink()
+    return len(files)

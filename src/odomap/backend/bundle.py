@@ -6,11 +6,11 @@ over a window of poses, some of them held fixed to tie the gauge, by Levenberg-M
 solves the Schur complement on the poses (see `schur`) and is taken if the cost falls. ρ is Huber's
 loss. The whole loop is one compiled call without the interpreter's lock.
 
-The covariance of the free poses, given the fixed ones, is the inverse of the undamped reduced system at
-the solution; landmarks are marginalised by the elimination itself.
+The covariance of the free poses, given the fixed ones, is the inverse of the undamped reduced
+system at the solution; landmarks are marginalised by the elimination itself.
 
-Reference: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999; Mouragnon et al., "Real Time
-Localization and 3D Reconstruction", CVPR 2006 (windows).
+Reference: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999; Mouragnon et al., "Real
+Time Localization and 3D Reconstruction", CVPR 2006 (windows).
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
 """Cholesky factorisation of small dense matrices, inside compiled loops.
 
 A symmetric positive definite A = L Lᵀ is factored column by column and solved by two triangular
-substitutions: n³/3 operations. LAPACK would be as fast from a hundred rows on, but calling it holds
-the interpreter's lock or a second compiled library; the windows of odometry have 30 to 150 unknowns.
+substitutions: n³/3 operations. LAPACK would be as fast from a hundred rows on, but calling it
+holds the interpreter's lock or a second compiled library; the windows of odometry have 30 to 150
+unknowns.
 
 Reference: Golub, Van Loan, "Matrix Computations", 4th ed., section 4.2.
 """

@@ -2,9 +2,10 @@
 
     min_T  Σ_o ρ( ‖r_o(T, p_o)‖² )
 
-by iteratively reweighted Gauss-Newton from a predicted pose, with Huber's loss first and, once the
-pose is near, observations beyond the χ² gate left out. A fixed landmark is not an exact one: its own
-uncertainty adds to that of the measurement, so weights may differ from observation to observation.
+by iteratively reweighted Gauss-Newton from a predicted pose, with Huber's loss first and, once
+the pose is near, observations beyond the χ² gate left out. A fixed landmark is not an exact one:
+its own uncertainty adds to that of the measurement, so weights may differ from observation to
+observation.
 
 Cost: O(observations) per step; 300 observations take a fraction of a millisecond.
 
@@ -127,7 +128,7 @@ def _solve_kernel(
     chi2: Array,
     covariance: Array,
 ) -> bool:
-    """Gauss-Newton, R and t in place: round 0 with all observations, round 1 with those in the gate."""
+    """Gauss-Newton, R and t in place: first with all observations, then with those in the gate."""
     r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
     H, b = np.empty((6, 6)), np.empty(6)
     R_new, t_new = np.empty((3, 3)), np.empty(3)

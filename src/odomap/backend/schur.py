@@ -7,8 +7,8 @@ With poses ξ and landmarks p the damped normal equations are
 
 so S δξ = −(a − W C⁻¹ c) with S = A − W C⁻¹ Wᵀ, and δp = −C⁻¹ (c + Wᵀ δξ). Observations come
 sorted by landmark; a landmark seen n times adds n² blocks of 6x6 to S. Levenberg's damping is
-Marquardt's: the diagonal is multiplied by 1 + λ. Sums run in a fixed order, so the result is the same
-on every run.
+Marquardt's: the diagonal is multiplied by 1 + λ. Sums run in a fixed order, so the result is the
+same on every run.
 
 Cost: O(observations) to linearise, O(Σ n²) to eliminate, O(poses³) to solve.
 
@@ -29,7 +29,7 @@ Index = NDArray[np.int64]
 
 @kernel(reorder=True)
 def invert_3x3(C: Array, inverse: Array) -> bool:
-    """Write the inverse of a symmetric 3x3 by its adjugate; False if it is not positive definite."""
+    """Write the inverse of a symmetric 3x3 by its adjugate; False unless positive definite."""
     c00 = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
     c01 = C[0, 2] * C[1, 2] - C[0, 1] * C[2, 2]
     c02 = C[0, 1] * C[1, 2] - C[0, 2] * C[1, 1]

@@ -1,9 +1,9 @@
 """Association: where the landmarks of a reference keyframe are in a new image.
 
-Two ways with one face. `FlowAssociation` aligns the patches around the reference's keypoints in the
-new image; it finds nearly all of them, to a twentieth of a pixel, as long as the view changes little.
-`DescriptorAssociation` detects features in every image and compares descriptors near the expected
-places; it costs detection and description, and survives larger changes.
+Two ways with one face. `FlowAssociation` aligns the patches around the reference's keypoints in
+the new image; it finds nearly all of them, to a twentieth of a pixel, as long as the view changes
+little. `DescriptorAssociation` detects features in every image and compares descriptors near the
+expected places; it costs detection and description, and survives larger changes.
 
 Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Montiel, Tardós,
 "ORB-SLAM", T-RO 2015, section V.
@@ -58,6 +58,8 @@ class Reference:
         descriptors: (N, D) uint8, D = 0 where association does without.
         seen: (N,) number of keyframes that have seen each so far.
         depth: (N,) metres along the optical axis, in this keyframe.
+        first_keyframe: (N,) keyframe each was first seen in.
+        first_keypoint: (N, 2) where in its image.
     """
 
     keyframe_id: int
@@ -67,6 +69,8 @@ class Reference:
     descriptors: NDArray[np.uint8]
     seen: NDArray[np.int64]
     depth: NDArray[np.float64]
+    first_keyframe: NDArray[np.int64]
+    first_keypoint: NDArray[np.float64]
 
 
 class Association(Protocol):
@@ -84,13 +88,13 @@ class Association(Protocol):
         guess: NDArray[np.float64],
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return pixels (n, 2) and found (n,) of the reference's `rows`, expected at `guess` (n, 2)."""
+        """Return pixels (n, 2) and found (n,) of rows of the reference, expected at `guess`."""
         ...
 
     def extend(
         self, view: View, occupied: NDArray[np.float64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """Return up to `count` new keypoints (n, 2) away from the occupied ones, with descriptors."""
+        """Return up to `count` new keypoints (n, 2) away from others, with descriptors."""
         ...
 
     def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -1,8 +1,8 @@
 """Making stereo keyframes: depth for what is tracked, new landmarks where nothing is.
 
-The points tracked into the image keep their landmarks; corners are detected in the gaps between them.
-Stereo measures the disparity of both: near the expected one for tracked points, over the whole range
-for new ones. New points with a disparity become landmarks.
+The points tracked into the image keep their landmarks; corners are detected in the gaps between
+them. Stereo measures the disparity of both: near the expected one for tracked points, over the
+whole range for new ones. New points with a disparity become landmarks.
 
 Reference: Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017, section III-A.
 """
@@ -15,6 +15,7 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.association import Association, Reference, View
 from odomap.system.config import Config
+from odomap.system.firstsight import FirstSights
 from odomap.vision.features import Features
 from odomap.vision.rectifier import Rectifier
 from odomap.vision.stereo import match_sparse, sgbm_disparity
@@ -30,11 +31,14 @@ class StereoKeyframes:
     def __init__(
         self, map: Map, rectifier: Rectifier, association: Association, config: Config
     ) -> None:
-        self._map, self._rectifier, self._association, self._config = (
+        self._map, self._rectifier = map, rectifier
+        self._association, self._config = association, config
+        self._sights = FirstSights(
             map,
-            rectifier,
-            association,
-            config,
+            rectifier.camera,
+            rectifier.T_body_camera,
+            config.flow,
+            config.window.size + config.window.fixed,
         )
 
     def make(
@@ -42,10 +46,10 @@ class StereoKeyframes:
         view: View,
         right: NDArray[np.uint8],
         T_world_body: Array,
-        landmark_ids: NDArray[np.int64],
+        tracked: Reference | None,
+        rows: NDArray[np.int64],
         pixels: Array,
         covariance: Array,
-        parent: int,
     ) -> Reference:
         """Add a keyframe with its landmarks and observations to the map.
 
@@ -53,14 +57,18 @@ class StereoKeyframes:
             view: the left image.
             right: the raw right image.
             T_world_body: (4, 4).
-            landmark_ids: (n,) landmarks tracked into the view.
+            tracked: the keyframe it was tracked from, None for the first.
+            rows: (n,) rows of that keyframe found in the view.
             pixels: (n, 2) where.
             covariance: (6, 6) of the pose.
-            parent: keyframe it was tracked from, −1 for the first.
 
         Returns:
             The keyframe as the tracker needs it.
         """
+        landmark_ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
+        pixels, first_keyframe, first_keypoint = self._first(
+            view, T_world_body, tracked, rows, pixels
+        )
         fresh, described = self._association.extend(
             view, pixels, self._config.features.count - len(pixels)
         )
@@ -90,16 +98,41 @@ class StereoKeyframes:
         self._map.add_keyframe(
             Keyframe(keyframe_id, view.stamp_ns, features),
             T_world_body,
-            parent=parent,
+            parent=-1 if tracked is None else tracked.keyframe_id,
             covariance=covariance,
         )
-        n = len(pixels)
+        n, fresh_ones = len(pixels), np.full(len(keypoints) - len(pixels), -1)
         points_camera = bearings[n:] / bearings[n:, 2:] * depth[n:, None]
         T = self._rectifier.T_body_camera
         new_ids = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
         ids = np.concatenate([landmark_ids, new_ids])
         self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
-        return self.reference(keyframe_id, view, keypoints, ids, descriptors)
+        self._sights.remember(keyframe_id, view)
+        first = np.concatenate([first_keyframe, fresh_ones])
+        return self.reference(
+            keyframe_id,
+            view,
+            keypoints,
+            ids,
+            descriptors,
+            np.where(first < 0, keyframe_id, first),
+            np.concatenate([first_keypoint, keypoints[n:]]),
+        )
+
+    def _first(
+        self,
+        view: View,
+        T_world_body: Array,
+        tracked: Reference | None,
+        rows: NDArray[np.int64],
+        pixels: Array,
+    ) -> tuple[Array, NDArray[np.int64], Array]:
+        """Align tracked points to their first sights; −1 for those that start afresh here."""
+        if tracked is None or self._config.tracking.association != "flow":
+            return pixels, np.full(len(pixels), -1), pixels
+        pixels, kept = self._sights.align(view, T_world_body, tracked, rows, pixels)
+        keyframes = np.where(kept, tracked.first_keyframe[rows], -1)
+        return pixels, keyframes, np.where(kept[:, None], tracked.first_keypoint[rows], pixels)
 
     def reference(
         self,
@@ -108,6 +141,8 @@ class StereoKeyframes:
         keypoints: Array,
         ids: NDArray[np.int64],
         descriptors: NDArray[np.uint8],
+        first_keyframe: NDArray[np.int64],
+        first_keypoint: Array,
     ) -> Reference:
         """Gather what the tracker needs of a keyframe from the map as it is now."""
         points = self._map.points_world(ids)
@@ -122,6 +157,8 @@ class StereoKeyframes:
             descriptors[good],
             self._map.count_observers(ids[good]),
             depth[good],
+            first_keyframe[good],
+            first_keypoint[good],
         )
 
     def _expected_disparity(self, T_world_body: Array, landmark_ids: NDArray[np.int64]) -> Array:
@@ -139,9 +176,8 @@ class StereoKeyframes:
         if config.method == "sgbm":
             dense = sgbm_disparity(view.image, image, config)
             columns, rows = np.round(keypoints).astype(np.int64).T
-            return dense[rows.clip(0, len(dense) - 1), columns.clip(0, dense.shape[1] - 1)].astype(
-                np.float64
-            )
+            rows, columns = rows.clip(0, len(dense) - 1), columns.clip(0, dense.shape[1] - 1)
+            return np.asarray(dense[rows, columns], np.float64)
         low = np.full(len(keypoints), -2.0)
         high = np.full(len(keypoints), float(config.max_disparity_px))
         low[: len(expected)], high[: len(expected)] = expected - 4.0, expected + 4.0
@@ -165,6 +201,6 @@ class StereoKeyframes:
         swapped = int((mirrored > 1.0).sum())
         if swapped >= 30 and swapped > 2 * matched:
             raise CalibrationError(
-                f"stereo pair: {swapped} of {len(points)} points have negative disparity and {matched} positive: "
-                "left and right are swapped, exchange the two cameras"
+                f"stereo pair: {swapped} of {len(points)} points have negative disparity, {matched} "
+                "positive: left and right are swapped, exchange the two cameras"
             )

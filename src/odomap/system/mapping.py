@@ -1,11 +1,12 @@
 """Local mapping of an odometry: bundle adjustment over the last keyframes.
 
-The newest keyframes and the landmarks they see are adjusted together, held in place by the keyframes
-just before them. Observations that disagree with the solution have little weight in it (Huber) and
-are dropped for the next; keyframes that leave the window are retired, so that memory stays flat.
+The newest keyframes and the landmarks they see are adjusted together, held in place by the
+keyframes just before them. Observations that disagree with the solution have little weight in it
+(Huber) and are dropped for the next; keyframes that leave the window are retired, so that memory
+stays flat.
 
-Covariance. The window gives each keyframe's covariance S given the fixed ones. Its uncertainty in the
-world adds that of the keyframe a that ties the window, as it was when a itself was the newest:
+Covariance. The window gives each keyframe's covariance S given the fixed ones. Its uncertainty in
+the world adds that of the keyframe a that ties the window, as it was when a was the newest:
 
     Σ_k = Ad(T_k_a) Σ_a Ad(T_k_a)ᵀ + S_k.
 
@@ -85,7 +86,7 @@ class WindowMapper:
         self._recent = []
 
     def add(self, keyframe_id: int) -> None:
-        """Take in a keyframe that is already in the map, and adjust the window that ends with it."""
+        """Take in a keyframe that is in the map already, and adjust the window it ends."""
         self._recent.append(keyframe_id)
         if len(self._recent) < 2:
             return

@@ -3,11 +3,12 @@
 Every frame is placed against the landmarks of the last keyframe (`tracking`). When the view has
 changed enough the frame becomes a keyframe: new corners fill the gaps between the tracked ones,
 stereo gives all of them depth (`keyframing`), and the window of the last keyframes is adjusted
-(`mapping`). What is remembered hangs from keyframes, so an adjusted window moves the frames before it.
+(`mapping`). What is remembered hangs from keyframes, so an adjusted window moves the frames
+before it.
 
 When too few landmarks agree with a pose the frame is lost, and says so. The next frames are tried
-with descriptors against the last keyframe (`relocalization`); if that fails for some frames, odometry
-starts anew where it was last, with a covariance that admits it.
+with descriptors against the last keyframe (`relocalization`); if that fails for some frames,
+odometry starts anew where it was last, with a covariance that admits it.
 
     vo = StereoVO(source.rig)
     path = [vo.track(frame).T_world_body for frame in source]
@@ -173,7 +174,7 @@ class StereoVO:
         T_world_body = self._last_pose()
         self._mapper.restart()
         reference = self._keyframes.make(
-            view, right, T_world_body, none, np.empty((0, 2)), covariance, -1
+            view, right, T_world_body, None, none, np.empty((0, 2)), covariance
         )
         clock.lap("keyframe")
         count, needed = len(reference.landmark_ids), 2 * self._config.tracking.min_inliers
@@ -333,16 +334,22 @@ class StereoVO:
             view,
             right,
             located.T_world_body,
-            reference.landmark_ids[rows],
+            reference,
+            rows,
             located.pixels[located.inliers],
             np.zeros((6, 6)),
-            reference.keyframe_id,
         )
         clock.lap("keyframe")
         self._mapper.add(made.keyframe_id)
         clock.lap("bundle")
         self._reference = self._keyframes.reference(
-            made.keyframe_id, view, made.keypoints, made.landmark_ids, made.descriptors
+            made.keyframe_id,
+            view,
+            made.keypoints,
+            made.landmark_ids,
+            made.descriptors,
+            made.first_keyframe,
+            made.first_keypoint,
         )
         self._since_keyframe = 0
         return made.keyframe_id
@@ -388,7 +395,8 @@ def _why_lost(located: Located, needed: int, view: View) -> str:
             f"the image is nearly uniform (contrast {spread:.0f} of 255): covered lens or no light?"
         )
     elif len(located.rows) < needed:
-        cause = f"{len(located.rows)} of {located.expected} landmarks found again: motion blur or too fast?"
+        again = f"{len(located.rows)} of {located.expected} landmarks found again"
+        cause = f"{again}: motion blur or too fast?"
     else:
         cause = "what was found does not fit one motion: moving objects or a wrong calibration?"
     return f"{located.num_inliers} inliers of {needed} needed: {cause}"

@@ -1,9 +1,9 @@
 """Tracking: where the body is at a new frame, from the landmarks of a reference keyframe.
 
-A constant velocity predicts the pose; the landmarks are projected with it, found in the image (see
-`association`), and the pose that agrees with them is solved for. A landmark's depth is only known to
-σ_z / z = σ_d / d; by how much that blurs its projection in the new view is added to the noise of the
-observation, so that a near point just created does not pull harder than it knows.
+A constant velocity predicts the pose; the landmarks are projected with it, found in the image
+(see `association`), and the pose that agrees with them is solved for. A landmark's depth is only
+known to σ_z / z = σ_d / d; by how much that blurs its projection in the new view is added to the
+noise of the observation, so that a near point just created does not pull harder than it knows.
 
 Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces", ISMAR 2007.
 """
@@ -19,6 +19,7 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.system.association import Association, Reference, View
 from odomap.system.mapping import StereoNoise
+from odomap.vision.flow import facing_warp
 
 __all__ = ["ConstantVelocity", "Located", "PoseTracker", "TrackingConfig"]
 
@@ -148,7 +149,7 @@ class PoseTracker:
             (points_camera[:, 2] > 0.05)
             & self._camera.is_inside(np.nan_to_num(guess, nan=-1.0), 2.0)
         )
-        warp = self._warp(points_camera[rows], T_reference_camera)
+        warp = facing_warp(points_camera[rows], T_reference_camera)
         pixels, found = self._association.find(reference, view, rows, guess[rows], warp)
         rows, pixels = rows[found], pixels[found]
         weights = self._weights(points_camera[rows], T_reference_camera, reference, rows)
@@ -177,14 +178,6 @@ class PoseTracker:
     def _normalised(self, pixels: Array) -> Array:
         c = self._camera
         return np.asarray((pixels - (c.cx, c.cy)) / (c.fx, c.fy))
-
-    def _warp(self, points_camera: Array, T_reference_camera: Array) -> Array:
-        """Offsets in the reference per offset in the view, for patches that face the camera."""
-        R = T_reference_camera[:3, :3]
-        there = points_camera @ R.T + T_reference_camera[:3, 3]
-        xy = there[:, :2] / there[:, 2:]
-        ratio = (points_camera[:, 2] / there[:, 2])[:, None, None]
-        return np.asarray(ratio * (R[None, :2, :2] - xy[:, :, None] * R[None, 2:, :2]))
 
     def _weights(
         self,

@@ -4,13 +4,14 @@ Tracking wants points that are (a) well localised in both directions and (b) eve
 cluster of strong corners on one object constrains little of the pose. Candidates come from a
 detector (FAST, Harris, ORB or SIFT); FAST candidates are ranked by the smaller eigenvalue of the
 structure tensor, Σ_w ∇I ∇Iᵀ, since FAST's own score does not tell an edge from a corner. A greedy
-pass from the strongest to the weakest then keeps a candidate only if none is kept within a radius r,
-where r follows from the number wanted: a Poisson-disk sample weighted by strength, O(n log n).
+pass from the strongest to the weakest then keeps a candidate only if none is kept within a radius
+r, where r follows from the number wanted: a Poisson-disk sample weighted by strength, O(n log n).
 
 Reference: Shi, Tomasi, "Good features to track", CVPR 1994; Rosten, Drummond, "Machine learning for
 high-speed corner detection", ECCV 2006.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -122,13 +123,17 @@ def _candidates(image: Image, config: FeatureConfig, wanted: int) -> Corners:
         found = cv2.goodFeaturesToTrack(
             image, 4 * wanted, 0.002, 3, blockSize=5, useHarrisDetector=True, k=0.04
         )
-        points = np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        points = (
+            np.empty((0, 2), np.float32)
+            if found is None
+            else np.asarray(found, np.float32).reshape(-1, 2)
+        )
         order = np.arange(len(points), 0, -1, dtype=np.float64)  # they come sorted by response
         return Corners(points, order, np.zeros(len(points), np.uint8))
     detector = (
-        cv2.ORB_create(nfeatures=3 * wanted, fastThreshold=config.threshold)
+        cv2.ORB.create(nfeatures=3 * wanted, fastThreshold=config.threshold)
         if config.detector == "orb"
-        else cv2.SIFT_create(nfeatures=3 * wanted)
+        else cv2.SIFT.create(nfeatures=3 * wanted)
     )
     keypoints = detector.detect(image, None)
     if not keypoints:
@@ -139,14 +144,14 @@ def _candidates(image: Image, config: FeatureConfig, wanted: int) -> Corners:
 
 
 def _fast(image: Image, threshold: int, wanted: int) -> Corners:
-    keypoints: tuple[cv2.KeyPoint, ...] = ()
+    keypoints: Sequence[cv2.KeyPoint] = ()
     for level in (threshold, max(threshold // 2, 3)):
-        keypoints = cv2.FastFeatureDetector_create(level, True).detect(image, None)
+        keypoints = cv2.FastFeatureDetector.create(level, True).detect(image, None)
         if len(keypoints) >= 2 * wanted:
             break
     if not keypoints:
         return _empty()
-    points = cv2.KeyPoint_convert(keypoints)
+    points = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     strength = corner_strength(image, points)
     return Corners(points, strength, np.zeros(len(points), np.uint8))
 
@@ -256,7 +261,7 @@ def _spread_kernel(
     width: int,
     taken: NDArray[np.float32],
 ) -> int:
-    """Greedy Poisson-disk choice; a grid of cells of the radius' size, linked lists in the cells."""
+    """Greedy Poisson-disk choice; cells of the radius' size, linked lists in the cells."""
     cell = max(radius, 1.0)
     rows, cols = int(height / cell) + 1, int(width / cell) + 1
     head = np.full((rows, cols), -1, np.int64)
@@ -323,7 +328,7 @@ def describe(
         keypoints = [
             cv2.KeyPoint(k.pt[0], k.pt[1], 7.0, 0.0, 0.0, 0, k.class_id) for k in keypoints
         ]
-    extractor = cv2.SIFT_create() if detector == "sift" else cv2.ORB_create()
+    extractor = cv2.SIFT.create() if detector == "sift" else cv2.ORB.create()
     kept, descriptors = extractor.compute(image, keypoints)
     if descriptors is None or len(kept) == 0:
         return np.empty((0, 128 if detector == "sift" else 32), np.uint8), np.empty(0, np.int64)
@@ -333,7 +338,7 @@ def describe(
 
 
 def _angle(image: Image, x: float, y: float) -> float:
-    """Orientation by the intensity centroid of the 31x31 patch, degrees (Rublee et al., ORB, 2011)."""
+    """Orientation by the intensity centroid of the 31x31 patch, degrees (ORB, 2011)."""
     u, v = round(float(x)), round(float(y))
     patch = image[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16].astype(np.float64)
     if patch.shape != (31, 31):

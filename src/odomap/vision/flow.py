@@ -4,13 +4,13 @@ For each point a patch T around c in the template image is found again in the ta
 
     min_p  Σ_d [ (I(p + d) − Ī) − s (T(c + B d) − T̄) ]²
 
-over the position p, with the means Ī, T̄ and the gain s removed in closed form, so that exposure and
-vignetting do not pull the answer. B is the local affine map of target offsets to template offsets
-that the predicted motion implies (identity when nothing is known): with it a patch keeps its content
-when the camera rolls or approaches. The inverse-compositional form linearises the template, hence
-one 2x2 Hessian per point and level. A point is followed from the coarsest level of a pyramid to the
-finest; what it found is trusted if the correlation of the patches is high and, for the
-forward–backward check, if tracking back ends where it began.
+over the position p, with the means Ī, T̄ and the gain s removed in closed form, so that exposure
+and vignetting do not pull the answer. B is the local affine map of target offsets to template
+offsets that the predicted motion implies (identity when nothing is known): with it a patch keeps
+its content when the camera rolls or approaches. The inverse-compositional form linearises the
+template, hence one 2x2 Hessian per point and level. A point is followed from the coarsest level
+of a pyramid to the finest; what it found is trusted if the correlation of the patches is high
+and, for the forward–backward check, if tracking back ends where it began.
 
 Cost: points x levels x iterations x patch area; 400 points take a few milliseconds.
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["Flow", "FlowConfig", "align_patches", "pyramid", "track"]
+__all__ = ["Flow", "FlowConfig", "align_patches", "facing_warp", "pyramid", "track"]
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
@@ -50,7 +50,7 @@ class FlowConfig:
 
 @dataclass(frozen=True)
 class Flow:
-    """Where points went: (N, 2) float64 pixels, (N,) bool whether found, (N,) patch correlations."""
+    """Where points went: (N, 2) pixels, (N,) whether found, (N,) patch correlations."""
 
     points: Points
     found: NDArray[np.bool_]
@@ -61,7 +61,7 @@ def pyramid(image: Image, levels: int) -> tuple[Image, ...]:
     """Return the image and its halvings, finest first, each smoothed before it is sampled."""
     images = [np.ascontiguousarray(image)]
     for _ in range(levels - 1):
-        images.append(cv2.pyrDown(images[-1]))
+        images.append(np.asarray(cv2.pyrDown(images[-1]), np.uint8))
     return tuple(images)
 
 
@@ -94,7 +94,13 @@ def track(
         # The way back starts off by as much as the prediction was: else it would agree too easily.
         start = points[index] + (forward.points[index] - guess[index]).clip(-4.0, 4.0)
         back = _coarse_to_fine(
-            target, template, forward.points[index], start, np.linalg.inv(warp[index]), config, 2
+            target,
+            template,
+            forward.points[index],
+            start,
+            np.asarray(np.linalg.inv(warp[index]), np.float64),
+            config,
+            2,
         )
         off = np.linalg.norm(back.points - points[index], axis=1)
         found[index] = back.found & (off <= config.max_backward_px)
@@ -129,6 +135,23 @@ def _coarse_to_fine(
         positions = np.where(fine.found[:, None], fine.points / scale, positions)
         status, correlation = fine.found, fine.correlation
     return Flow(positions, status, correlation)
+
+
+def facing_warp(points_camera: Points, T_template_camera: NDArray[np.float64]) -> Points:
+    """Return how patches deform between two views, if their surfaces face the camera.
+
+    Args:
+        points_camera: (N, 3) the patches' centres in the target camera.
+        T_template_camera: (4, 4) from the target to the template camera.
+
+    Returns:
+        (N, 2, 2) offsets in the template per offset in the target.
+    """
+    R = T_template_camera[:3, :3]
+    there = points_camera @ R.T + T_template_camera[:3, 3]
+    xy = there[:, :2] / there[:, 2:]
+    ratio = (points_camera[:, 2] / there[:, 2])[:, None, None]
+    return np.asarray(ratio * (R[None, :2, :2] - xy[:, :, None] * R[None, 2:, :2]))
 
 
 def align_patches(
@@ -175,7 +198,7 @@ def align_patches(
 def _sample_template(
     image: Image, x: float, y: float, B: NDArray[np.float64], half: int, patch: NDArray[np.float32]
 ) -> bool:
-    """patch[v, u] = image((x, y) + B (u, v)), bilinear, with a margin of one pixel for gradients."""
+    """patch[v, u] = image((x, y) + B (u, v)), bilinear, with a margin for gradients."""
     height, width = image.shape
     reach = half + 1.0
     rx = (abs(B[0, 0]) + abs(B[0, 1])) * reach
@@ -210,7 +233,7 @@ def _sample_template(
 
 @kernel(reorder=True)
 def _sample_target(image: Image, x: float, y: float, half: int, patch: NDArray[np.float32]) -> bool:
-    """patch[v, u] = image((x, y) + (u, v)), bilinear; the four weights are the same for all pixels."""
+    """patch[v, u] = image((x, y) + (u, v)), bilinear; the same four weights for all."""
     height, width = image.shape
     left, top = int(np.floor(x)) - half, int(np.floor(y)) - half
     side = 2 * half + 1

@@ -1,14 +1,14 @@
 """Matching: which descriptor of one image belongs to which of another.
 
 Binary descriptors are compared by Hamming distance, SIFT's by Euclidean distance. A guided search
-compares a landmark only with features within a radius of where it is expected; without a guess every
-pair is compared. A match must be clearly better than the second best (Lowe's ratio) and be the best
-seen from both sides.
+compares a landmark only with features within a radius of where it is expected; without a guess
+every pair is compared. A match must be clearly better than the second best (Lowe's ratio) and be
+the best seen from both sides.
 
 Cost: guided, O(landmarks x features in the circle); without a guess, O(N M).
 
-Reference: Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, section 7.1;
-Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section V.
+Reference: Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, section
+7.1; Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section V.
 """
 
 from dataclasses import dataclass
@@ -116,13 +116,13 @@ def _distance(a: Descriptors, b: Descriptors) -> float:
     total = 0
     if len(a) == 32:
         for k in range(32):
-            bits = np.uint8(a[k] ^ b[k])
+            bits = int(a[k] ^ b[k])
             bits = bits - ((bits >> 1) & 0x55)
             bits = (bits & 0x33) + ((bits >> 2) & 0x33)
             total += (bits + (bits >> 4)) & 0x0F
     else:
         for k in range(len(a)):
-            difference = np.int64(a[k]) - np.int64(b[k])
+            difference = int(a[k]) - int(b[k])
             total += difference * difference
     return float(total)
 

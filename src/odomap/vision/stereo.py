@@ -1,17 +1,18 @@
 """Stereo: depth of points, or of all pixels, from a rectified pair.
 
-In a rectified pair a point at depth z appears on the same row of both images, shifted by the disparity
-d = x_left − x_right = f b / z. Sparse matching goes in two steps. A search along the row compares
-windows by their sum of absolute differences (SAD) at whole disparities and takes the best, if no other
-place is nearly as good. The best is then refined by aligning the patches as in `flow`, in both
-directions: fitting a parabola to SAD scores instead pulls disparities towards whole numbers, which
-turns into a scale error of the path, and a vertical offset left over from calibration would bend
-horizontal ones. Dense matching (`sgbm`) is OpenCV's semi-global matching.
+In a rectified pair a point at depth z appears on the same row of both images, shifted by the
+disparity d = x_left − x_right = f b / z. Sparse matching goes in two steps. A search along the
+row compares windows by their sum of absolute differences (SAD) at whole disparities and takes the
+best, if no other place is nearly as good. The best is then refined by aligning the patches as in
+`flow`, in both directions: fitting a parabola to SAD scores instead pulls disparities towards
+whole numbers, which turns into a scale error of the path, and a vertical offset left over from
+calibration would bend horizontal ones. Dense matching (`sgbm`) is OpenCV's semi-global matching.
 
 Cost: points x disparities x window area; 400 points in 128 disparities take a few milliseconds.
 
-Reference: Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 2008;
-Shimizu, Okutomi, "Precise Sub-pixel Estimation on Area-based Matching", ICCV 2001 (on pixel locking).
+Reference: Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI
+2008; Shimizu, Okutomi, "Precise Sub-pixel Estimation on Area-based Matching", ICCV 2001 (on pixel
+locking).
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ class StereoConfig:
     """How disparities are measured."""
 
     method: Literal["sparse", "sgbm"] = "sparse"
-    """sparse: sub-pixel matches of the features alone; sgbm: a dense map, looked up at the features."""
+    """sparse: sub-pixel matches of the features; sgbm: a dense map, looked up at the features."""
     max_disparity_px: int = 128
     """Largest disparity searched; nearer points get no depth."""
     half_search_px: int = 4
@@ -115,46 +116,41 @@ def _search_kernel(
     uniqueness: float,
     disparity: NDArray[np.float64],
 ) -> None:
-    """argmin_d Σ |L(x + u, y + v) − R(x − d + u, y + v)| over whole d, if clearly the best."""
+    """argmin_d Σ |L(x + u, y + v) − R(x − d + u, y + v)| over whole d, if clearly the best.
+
+    The innermost loop runs along the row of the right image, over all candidates at once.
+    """
     height, width = left.shape
-    side = 2 * half + 1
-    window = np.empty((side, side), np.int32)
-    scores = np.empty(4096, np.int32)
+    scores = np.empty(width, np.int32)
     for i in range(len(points)):
         x, y = int(np.floor(points[i, 0] + 0.5)), int(np.floor(points[i, 1] + 0.5))
         if x < half or y < half or x >= width - half or y >= height - half:
             continue
-        first = max(low[i], x + half + 1 - width)
-        last = min(min(high[i], x - half), first + 4095)
-        if last - first < 2:
+        begin = max(x - high[i], half)  # candidates are columns of the right image
+        count = min(x - low[i], width - half - 1) - begin + 1
+        if count < 3:
             continue
-        for v in range(side):
-            for u in range(side):
-                window[v, u] = left[y - half + v, x - half + u]
-        best, at = 2**30, first
-        for d in range(first, last + 1):
-            total = np.int32(0)
-            for v in range(side):
-                row = right[y - half + v]
-                begin = x - d - half
-                for u in range(side):
-                    total += abs(window[v, u] - np.int32(row[begin + u]))
-            scores[d - first] = total
-            if total < best:
-                best, at = total, d
-        other = 2**30
-        for d in range(first, last + 1):
-            if abs(d - at) > 2 and scores[d - first] < other:
-                other = scores[d - first]
-        if best < uniqueness * other:
-            disparity[i] = at
+        scores[:count] = 0
+        for v in range(-half, half + 1):
+            for u in range(-half, half + 1):
+                grey = np.int32(left[y + v, x + u])
+                row = right[y + v, begin + u : begin + u + count]
+                for k in range(count):
+                    scores[k] += abs(grey - np.int32(row[k]))
+        at = np.argmin(scores[:count])
+        other = np.int32(2**30)
+        for k in range(count):
+            if abs(k - at) > 2 and scores[k] < other:
+                other = scores[k]
+        if scores[at] < uniqueness * other:
+            disparity[i] = x - (begin + at)
 
 
 def sgbm_disparity(left: Image, right: Image, config: StereoConfig) -> NDArray[np.float32]:
     """Return the dense disparity map (H, W) float32 of a rectified pair, NaN where unknown."""
     block = 5
     count = 16 * max(1, -(-config.max_disparity_px // 16))
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=count,
         blockSize=block,
@@ -168,8 +164,7 @@ def sgbm_disparity(left: Image, right: Image, config: StereoConfig) -> NDArray[n
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     disparity = matcher.compute(left, right).astype(np.float32) / np.float32(16.0)
-    disparity[disparity <= 0] = np.nan
-    return disparity
+    return np.where(disparity > 0, disparity, np.float32(np.nan))
 
 
 def warm_up() -> None:
