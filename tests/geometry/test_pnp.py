@@ -209,7 +209,7 @@ def test_refining_agrees_with_the_search_and_resists_outliers():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"threshold_px": 0.0}, "threshold_px"),
+        ({"threshold_px": 0.0}, "threshold"),
         ({"confidence": 1.0}, "confidence"),
         ({"sigma_px": -1.0}, "sigma_px"),
         ({"sigma_px": np.ones(3)}, "sigma_px"),

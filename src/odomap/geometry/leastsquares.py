@@ -30,6 +30,8 @@ __all__ = ["LeastSquaresResult", "gauss_newton", "levenberg_marquardt"]
 X = TypeVar("X")
 Linearise = Callable[[X], tuple[Array, Array]]
 
+_STUCK = "no step lowers the cost: is the Jacobian right?"
+
 
 @dataclass(frozen=True)
 class LeastSquaresResult(Generic[X]):
@@ -77,6 +79,11 @@ def gauss_newton(
     """Minimise by full Gauss-Newton steps; for good starts, where nothing can go wrong.
 
     Arguments, result and errors as `levenberg_marquardt`; it stops when a step is small.
+
+    Example:
+        >>> result = gauss_newton(lambda x: (x - 3.0, np.eye(1)), np.zeros(1))
+        >>> result.x.round(6), result.reason
+        (array([3.]), 'the step is small')
     """
     now = _linearise(residual_and_jacobian, x0, loss or Loss(), block)
     initial, move = now.cost, retract or _add
@@ -120,15 +127,10 @@ def levenberg_marquardt(
         initial_damping: first λ.
 
     Returns:
-        The solution with its covariance, and why the iteration stopped.
+        The solution, its covariance, and why it stopped.
 
     Raises:
         InputError: shapes do not agree, or the start has no finite cost.
-
-    Example:
-        >>> result = levenberg_marquardt(lambda x: (x - 3.0, np.eye(1)), np.zeros(1))
-        >>> result.x.round(6), result.reason
-        (array([3.]), 'the step is small')
     """
     now = _linearise(residual_and_jacobian, x0, loss or Loss(), block)
     initial, move = now.cost, retract or _add
@@ -145,21 +147,18 @@ def levenberg_marquardt(
         after = _linearise(residual_and_jacobian, move(now.x, step), loss or Loss(), block)
         predicted = 0.5 * float(step @ (damping * scale * step - now.g))
         gained = now.cost - after.cost
-        if np.isfinite(after.cost) and gained >= 0.0:
-            done = gained <= cost_tolerance * now.cost
-            now = after
-            if done:
-                return _result(now, initial, iteration, True, "the cost no longer falls")
+        better = bool(np.isfinite(after.cost)) and gained >= 0.0
+        now = after if better else now
+        # A refused step that promised less than rounding can deliver also means the minimum.
+        if (gained if better else predicted) <= cost_tolerance * now.cost:
+            return _result(now, initial, iteration, True, "the cost no longer falls")
+        if better:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * gained / max(predicted, 1e-300) - 1.0) ** 3)
             damping, raise_by = max(damping, 1e-15), 2.0
-        elif predicted <= cost_tolerance * now.cost:
-            # The model promises less than rounding can deliver: this is the minimum.
-            return _result(now, initial, iteration, True, "the cost no longer falls")
         else:
             damping, raise_by = damping * raise_by, 2.0 * raise_by
-            if damping > 1e12:
-                reason = "no step lowers the cost: is the Jacobian right?"
-                return _result(now, initial, iteration, False, reason)
+        if damping > 1e12:
+            return _result(now, initial, iteration, False, _STUCK)
     return _result(now, initial, max_iterations, False, f"{max_iterations} iterations were spent")
 
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from odomap.errors import InputError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
-from odomap.geometry.ransac import draw_samples
+from odomap.geometry.ransac import check_search, draw_samples
 from odomap.geometry.so3 import Array, orthonormalize, tail_shape
 
 __all__ = ["PnpResult", "p3p", "refine_pose", "solve_pnp"]
@@ -127,9 +127,6 @@ def solve_pnp(
     Returns:
         The pose, its inliers and covariance; `converged` is False if there is none.
 
-    Raises:
-        InputError: shapes do not agree, or numbers outside their range.
-
     Example:
         >>> camera = Camera(intrinsics=(500.0, 500.0, 320.0, 240.0), resolution=(640, 480))
         >>> points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 5), (20, 3))
@@ -138,33 +135,28 @@ def solve_pnp(
     """
     from odomap.geometry.pnp_kernels import refine_pose_into, score_pose, search_pose
 
-    if not threshold_px > 0:
-        raise InputError(f"threshold_px: is {threshold_px}, must be above 0")
-    if not 0 < confidence < 1:
-        raise InputError(f"confidence: is {confidence}, must lie between 0 and 1")
+    check_search(threshold_px, confidence)
     sight = _sight(points_world, pixels, camera, sigma_px)
-    n = len(sight.rows)
-    wanted = max(4, min_inliers)
+    n, wanted = len(sight.rows), max(4, min_inliers)
     if n < wanted:
-        reason = f"{n} usable points of {wanted} needed"
-        return _nothing(SE3.identity(), sight.count, reason)
+        return _nothing(SE3.identity(), sight.count, f"{n} usable points of {wanted} needed")
     samples = draw_samples(n, 3, max_iterations, np.random.default_rng(seed))
     rays = np.concatenate([sight.plane, np.ones((n, 1))], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    R, t, inliers = np.eye(3), np.zeros(3), np.zeros(n, dtype=np.bool_)
+    R, t, inliers, H = np.eye(3), np.zeros(3), np.zeros(n, dtype=np.bool_), np.zeros((6, 6))
     data, limit = (sight.points, sight.plane, sight.slopes), threshold_px**2
     tried = search_pose(samples, data[0], rays, *data[1:], limit, confidence, 4, R, t, inliers)
-    H, steady = np.zeros((6, 6)), False
+    steady = False
     for _ in range(5):
         if np.count_nonzero(inliers) < wanted:
-            reason = f"{np.count_nonzero(inliers)} inliers of {wanted} needed: moved too far?"
+            reason = f"{inliers.sum()} inliers of {wanted} needed: moved too far?"
             return _nothing(SE3.identity(), sight.count, reason, tried)
-        before = inliers.copy()
-        _, _, steady = refine_pose_into(R, t, *data, sight.weights * inliers, 1e9, 20, H)
+        used = inliers.copy()
+        _, _, steady = refine_pose_into(R, t, *data, sight.weights * used, 1e9, 20, H)
         score_pose(np.ascontiguousarray(R.T), -R.T @ t, *data, limit, inliers)
-        if np.array_equal(before, inliers):
+        if np.array_equal(used, inliers):
             break
-    return _pnp_result(sight, R, t, H, inliers, before, tried, steady)
+    return _pnp_result(sight, R, t, H, inliers, tried, steady)
 
 
 def refine_pose(
@@ -208,7 +200,7 @@ def refine_pose(
     inliers = np.zeros(len(sight.rows), dtype=np.bool_)
     limit = min(threshold_px**2, 1e18)
     score_pose(np.ascontiguousarray(R.T), -R.T @ t, *data, limit, inliers)
-    return _pnp_result(sight, R, t, H, inliers, inliers, steps, steady)
+    return _pnp_result(sight, R, t, H, inliers, steps, steady)
 
 
 def _sight(points: ArrayLike, pixels: ArrayLike, camera: Camera, sigma_px: ArrayLike) -> _Sight:
@@ -241,11 +233,10 @@ def _pnp_result(
     t: Array,
     H: Array,
     inliers: NDArray[np.bool_],
-    used: NDArray[np.bool_],
     iterations: int,
     steady: bool,
 ) -> PnpResult:
-    """Turn what the kernels left into a value; H is the information of the rows `used`."""
+    """Turn what the kernels left into a value; H is the information of the inliers."""
     T_world_camera = SE3.from_parts(orthonormalize(R), t)
     # Unit diagonal first: metres and radians may differ by orders of magnitude.
     d = np.sqrt(np.maximum(np.diag(H), 1e-300))

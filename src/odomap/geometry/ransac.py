@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from odomap.errors import InputError
 from odomap.geometry.so3 import Array
 
-__all__ = ["RansacResult", "draw_samples", "ransac", "samples_needed"]
+__all__ = ["RansacResult", "check_search", "draw_samples", "ransac", "samples_needed"]
 
 M = TypeVar("M")
 Rows = NDArray[np.int64]
@@ -131,10 +131,7 @@ def ransac(
     Raises:
         InputError: a threshold or confidence outside its range.
     """
-    if not threshold > 0:
-        raise InputError(f"threshold: is {threshold}, must be above 0")
-    if not 0 < confidence < 1:
-        raise InputError(f"confidence: is {confidence}, must lie between 0 and 1")
+    check_search(threshold, confidence)
     best: M | None = None
     best_cost, best_inliers, drawn = np.inf, np.zeros(n, dtype=np.bool_), 0
     if n < sample_size:
@@ -159,6 +156,14 @@ def ransac(
     if np.count_nonzero(best_inliers) < max(min_inliers, min(sample_size + 1, n)):
         return RansacResult(None, np.zeros(n, dtype=np.bool_), drawn, np.inf)
     return RansacResult(best, best_inliers, drawn, best_cost)
+
+
+def check_search(threshold: float, confidence: float) -> None:
+    """Raise InputError unless the threshold is above 0 and the confidence between 0 and 1."""
+    if not threshold > 0:
+        raise InputError(f"threshold: is {threshold}, must be above 0")
+    if not 0 < confidence < 1:
+        raise InputError(f"confidence: is {confidence}, must lie between 0 and 1")
 
 
 def _score(residuals: Array, threshold: float) -> tuple[float, NDArray[np.bool_]]:
