@@ -89,7 +89,7 @@ def expose(
     Returns:
         (H, W) uint8.
     """
-    light = picture.radiance
+    light, pinhole = picture.radiance, np.array(pinhole)
     if noise.softness_px > 0:
         import cv2
 
@@ -139,7 +139,7 @@ def measure_depth(depth: F32, noise: float, key: tuple[int, int]) -> F32:
 
 @kernel
 def smear_kernel(light: F32, flow: F32, out: F32) -> None:
-    """Average the light along each pixel's own flow, centred, one sample per 0.7 pixels."""
+    """Average the light along each pixel's own flow, centred, about one sample per pixel."""
     height, width = light.shape
     for row in range(height):
         for column in range(width):
@@ -148,7 +148,10 @@ def smear_kernel(light: F32, flow: F32, out: F32) -> None:
             if length < 0.15:
                 out[row, column] = light[row, column]
                 continue
-            samples = 2 + int(min(length, 40.0) / 0.7)
+            samples = max(2, int(min(length, 40.0)))
+            # As wide as a box of that length: the same second moment.
+            wide = 1.0 / np.sqrt(1.0 - 1.0 / (samples * samples))
+            fx, fy = fx * wide, fy * wide
             total = 0.0
             for k in range(samples):
                 f = (k + 0.5) / samples - 0.5

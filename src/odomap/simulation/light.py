@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.kernels import kernel
 from odomap.simulation.rays import BoxTree, cast_kernel
 
-__all__ = ["LightGrid", "Lights", "bake"]
+__all__ = ["LightGrid", "Lights", "bake", "warm_up"]
 
 Array = NDArray[np.float64]
 LAMP_RAYS = 3
@@ -88,17 +89,8 @@ def bake(
     cells = np.clip(np.ceil(faces[:, :2] / lights.grid_m).astype(np.int64), 1, 63) + 1
     count = cells[:, 0] * cells[:, 1]
     first = np.cumsum(count) - count
-    points = np.empty((int(count.sum()), 3))
-    normals = np.empty_like(points)
-    for k in range(len(frames)):
-        columns, rows = cells[k]
-        s = np.linspace(0.01, faces[k, 0] - 0.01, columns)
-        t = np.linspace(0.01, faces[k, 1] - 0.01, rows)
-        normal = -np.cross(frames[k, 3:6], frames[k, 6:9])
-        grid = s[None, :, None] * frames[k, 3:6] + t[:, None, None] * frames[k, 6:9]
-        part = slice(int(first[k]), int(first[k] + count[k]))
-        points[part] = grid.reshape(-1, 3) + frames[k, :3] + 0.004 * normal
-        normals[part] = normal
+    points, normals = np.empty((int(count.sum()), 3)), np.empty((int(count.sum()), 3))
+    grid_kernel(frames, faces, cells, points, normals)
     caster = _Caster(frames, faces, tree)
     values = lights.ambient * _openness(points, normals, lights, caster, rng)
     values += _direct(points, normals, lights, caster, rng)
@@ -129,6 +121,35 @@ class _Caster:
             hit,
         )
         return hit < 0
+
+
+@kernel
+def grid_kernel(
+    frames: Array, faces: Array, cells: NDArray[np.int64], points: Array, normals: Array
+) -> None:
+    """Write c + s u + t v + 3 cm n over the grid of each rectangle, 1 cm off its rim, and n."""
+    k = 0
+    for i in range(frames.shape[0]):
+        f = frames[i]
+        nx = f[5] * f[7] - f[4] * f[8]
+        ny = f[3] * f[8] - f[5] * f[6]
+        nz = f[4] * f[6] - f[3] * f[7]
+        for row in range(cells[i, 1]):
+            t = 0.01 + (faces[i, 1] - 0.02) * row / (cells[i, 1] - 1)
+            for column in range(cells[i, 0]):
+                s = 0.01 + (faces[i, 0] - 0.02) * column / (cells[i, 0] - 1)
+                points[k, 0] = f[0] + s * f[3] + t * f[6] + 0.03 * nx
+                points[k, 1] = f[1] + s * f[4] + t * f[7] + 0.03 * ny
+                points[k, 2] = f[2] + s * f[5] + t * f[8] + 0.03 * nz
+                normals[k, 0], normals[k, 1], normals[k, 2] = nx, ny, nz
+                k += 1
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    out = np.empty((4, 3))
+    frames = np.array([[0.0, 0, 0, 1, 0, 0, 0, 1, 0]])
+    grid_kernel(frames, np.ones((1, 8)), np.full((1, 2), 2), out, out.copy())
 
 
 def _openness(

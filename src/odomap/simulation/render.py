@@ -57,8 +57,8 @@ def render(
     Args:
         scene: what is there.
         camera: a pinhole without distortion.
-        Ts_world_camera: (3, 4, 4) poses at the middle, the start and the end of the exposure.
-        times: (3,) the same times in seconds, for what moves.
+        Ts_world_camera: (2, 4, 4) poses at the middle and the end of the exposure.
+        times: (2,) the same times in seconds, for what moves.
         supersample: places per pixel at which visibility is tested, up to 8.
 
     Returns:
@@ -74,19 +74,22 @@ def render(
     places = np.vstack([np.zeros((1, 2)), OFFSETS[:supersample]])
     ids = np.empty((len(places), *shape), np.int32)
     nearness = np.empty(shape, np.float32)
+    mixed = np.zeros(shape, np.bool_)
     spans = np.empty((2, shape[0]))
     order = np.argsort(np.linalg.norm(views[0][:, :3], axis=1), kind="stable")
     for k, place in enumerate(places):
         visible_kernel(views[0], rectangles.faces, order, pinhole, place, spans, nearness, ids[k])
+        if k > 0:
+            mixed |= ids[k] != ids[0]
     planes = np.empty((len(rectangles), 9))
     planes_kernel(views[0], rectangles.faces, pinhole, planes)
     radiance, depth = np.empty(shape, np.float32), np.empty(shape, np.float32)
     flow = np.empty((*shape, 2), np.float32)
     shade_kernel(
         ids,
+        mixed,
         planes,
         views[1],
-        views[2],
         rectangles.faces,
         rectangles.codes,
         scene.atlas.texels,
@@ -222,8 +225,8 @@ def warm_up() -> None:
     planes_kernel(frames, faces, pinhole, planes)
     shade_kernel(
         ids,
+        np.ones((4, 4), np.bool_),
         planes,
-        frames,
         frames,
         faces,
         np.array([[0, 0, 2, 2]]),

@@ -36,7 +36,7 @@ def room(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     height = float(rng.uniform(2.6, 3.1))
     lamps = np.column_stack([rng.uniform(-0.6, 0.6, (3, 2)) * half, np.full(3, height - 0.25)])
     lamps[2] = [0.0, 0.0, height - 0.5]
-    lights = Lights(0.55, 1.2, lamps, rng.uniform(1.2, 3.2, 3), grid_m=0.16)
+    lights = Lights(0.75, 1.2, lamps, rng.uniform(1.6, 4.0, 3), grid_m=0.16)
     builder = SceneBuilder(rng, lights, (0.9, 0.9))
     _shell(builder, half, height)
     _hangings(builder, half, height)

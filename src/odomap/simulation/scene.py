@@ -98,6 +98,21 @@ def _transformed(T: Array, frames: Array) -> Array:
     return moved
 
 
+def _faces_of_a_box() -> list[tuple[int, Array, Array, Array]]:
+    """Axis, outward normal, right and down of the six faces; the bottom is the last."""
+    faces = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            normal = np.zeros(3)
+            normal[axis] = sign
+            down = np.array([0.0, 0.0, -1.0]) if axis < 2 else np.array([0.0, -1.0, 0.0])
+            faces.append((axis, normal, np.cross(normal, down), down))
+    return faces
+
+
+FACES = _faces_of_a_box()
+
+
 class SceneBuilder:
     """Collects surfaces; everything random comes from one generator."""
 
@@ -156,7 +171,7 @@ class SceneBuilder:
         if origin_texels is not None:
             offset = np.array(origin_texels)
         scale = scale if scale > 0 else min((width - 1) / size[0], (height - 1) / size[1])
-        sides = [np.asarray(x, float) / np.linalg.norm(x) for x in (u, v)]
+        sides = [x / np.sqrt(x @ x) for x in (u, v)]
         self._frames.append(np.concatenate([np.asarray(corner, float), *sides]))
         self._faces.append([*size, scale, *offset, gain, float(two_sided), 0.0])
         self._textures.append(texture)
@@ -189,26 +204,19 @@ class SceneBuilder:
         axes = np.eye(3) if axes is None else axes
         kinds = [textures] * 3 if isinstance(textures, int) else textures
         half = 0.5 * np.array(size)
-        for axis in range(3):
-            for sign in (1.0, -1.0):
-                if axis == 2 and sign < 0 and not bottom:
-                    continue
-                normal = np.zeros(3)
-                normal[axis] = sign
-                down = np.array([0.0, 0.0, -1.0]) if axis < 2 else np.array([0.0, -1.0, 0.0])
-                right = np.cross(normal, down)
-                a, b = float(abs(right) @ half), float(abs(down) @ half)
-                corner = normal * half[axis] - right * a - down * b
-                self.rectangle(
-                    centre + axes @ corner,
-                    axes @ right,
-                    axes @ down,
-                    (2 * a, 2 * b),
-                    kinds[axis],
-                    scale,
-                    gain=gain,
-                    mover=mover,
-                )
+        for axis, normal, right, down in FACES if bottom else FACES[:-1]:
+            a, b = float(abs(right) @ half), float(abs(down) @ half)
+            corner = normal * half[axis] - right * a - down * b
+            self.rectangle(
+                centre + axes @ corner,
+                axes @ right,
+                axes @ down,
+                (2 * a, 2 * b),
+                kinds[axis],
+                scale,
+                gain=gain,
+                mover=mover,
+            )
 
     def build(self) -> Scene:
         """Bake the light and freeze the scene."""

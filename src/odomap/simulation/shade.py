@@ -55,20 +55,16 @@ def planes_kernel(frames: Array, faces: Array, pinhole: Array, planes: Array) ->
 
 @kernel
 def _texel(
-    texels: NDArray[np.uint8], first: int, log_w: int, log_h: int, level: int, s: float, t: float
+    texels: NDArray[np.uint8], first: int, log_w: int, log_h: int, s: float, t: float
 ) -> float:
-    """Interpolate level `level` of a wrapping texture at finest-level coordinates (s, t)."""
-    area = 1 << (log_w + log_h)
-    first += (4 * area - 4 * (area >> (2 * level))) // 3
-    mask_s, mask_t = (1 << (log_w - level)) - 1, (1 << (log_h - level)) - 1
-    shrink = 1.0 / (1 << level)
-    x, y = s * shrink - 0.5, t * shrink - 0.5
+    """Interpolate a wrapping image of 2^log_w x 2^log_h texels at (s, t)."""
+    x, y = s - 0.5, t - 0.5
     x0, y0 = np.floor(x), np.floor(y)
     wx, wy = x - x0, y - y0
+    mask_s, mask_t = (1 << log_w) - 1, (1 << log_h) - 1
     i0, j0 = int(x0) & mask_s, int(y0) & mask_t
     i1, j1 = (i0 + 1) & mask_s, (j0 + 1) & mask_t
-    stride = log_w - level
-    row0, row1 = first + (j0 << stride), first + (j1 << stride)
+    row0, row1 = first + (j0 << log_w), first + (j1 << log_w)
     upper = texels[row0 + i0] * (1.0 - wx) + texels[row0 + i1] * wx
     lower = texels[row1 + i0] * (1.0 - wx) + texels[row1 + i1] * wx
     value: float = upper * (1.0 - wy) + lower * wy
@@ -128,7 +124,8 @@ def _run(ids: Ids, places: Array, k: int, row: int, column: int) -> tuple[int, f
 
 @kernel
 def shade_kernel(
-    ids: Ids, planes: Array, start: Array, end: Array, faces: Array, codes: NDArray[np.int64],
+    ids: Ids, mixed: NDArray[np.bool_], planes: Array, end: Array, faces: Array,
+    codes: NDArray[np.int64],
     texels: NDArray[np.uint8], table: NDArray[np.int64], light: NDArray[np.float32],
     pinhole: Array, R: Array, sky: Array, places: Array,
     radiance: NDArray[np.float32], depth: NDArray[np.float32], flow: NDArray[np.float32],
@@ -138,6 +135,7 @@ def shade_kernel(
     layers, height, width = ids.shape
     for row in range(height):
         last, samples, level, w, step_s, step_t = -1, 1, 0, 0.0, 0.0, 0.0
+        first, log_w, log_h, shrink = 0, 0, 0, 1.0
         for column in range(width):
             centre = ids[0, row, column]
             k, n, x, y = 0, 1, float(column), float(row)
@@ -157,9 +155,9 @@ def shade_kernel(
                     s = z * (planes[i, 3] * x + planes[i, 4] * y + planes[i, 5])
                     t = z * (planes[i, 6] * x + planes[i, 7] * y + planes[i, 8])
                     which = codes[i, 0]
-                    first, log_w, log_h = table[which, 0], table[which, 1], table[which, 2]
                     if i != last or column % REUSE == 0:
                         # ∂s = z (∂(s/z) - s ∂(1/z)), the same for t.
+                        log_w, log_h = table[which, 1], table[which, 2]
                         samples, level, w, step_s, step_t = _footprint(
                             min(log_w, log_h),
                             z * (planes[i, 3] - s * planes[i, 0]),
@@ -168,36 +166,37 @@ def shade_kernel(
                             z * (planes[i, 7] - t * planes[i, 1]),
                         )
                         last = i
+                        # Level l starts after the sum of 4^-k of the area, k < l.
+                        area = 1 << (log_w + log_h)
+                        first = table[which, 0] + (4 * area - 4 * (area >> (2 * level))) // 3
+                        log_w, log_h, shrink = log_w - level, log_h - level, 0.5**level
                     # The place of a sub-sample may lie just off the rectangle: stay on it.
                     scale = faces[i, 2]
                     part_s = min(max((s - faces[i, 3]) / (faces[i, 0] * scale), 0.0), 1.0)
                     part_t = min(max((t - faces[i, 4]) / (faces[i, 1] * scale), 0.0), 1.0)
                     s = part_s * faces[i, 0] * scale + faces[i, 3]
                     t = part_t * faces[i, 1] * scale + faces[i, 4]
-                    albedo = 0.0
+                    albedo, fine = 0.0, 1.0 - w
                     for m in range(samples):
                         f = m - 0.5 * (samples - 1)
-                        for up in range(2 if w > 0.0 else 1):
-                            weight = w if up == 1 else 1.0 - w
-                            albedo += weight * _texel(
-                                texels, first, log_w, log_h, level + up,
-                                s + f * step_s, t + f * step_t,
-                            )  # fmt: skip
+                        a, b = (s + f * step_s) * shrink, (t + f * step_t) * shrink
+                        albedo += fine * _texel(texels, first, log_w, log_h, a, b)
+                        if w > 0.0:
+                            coarse = first + (1 << (log_w + log_h))
+                            albedo += w * _texel(
+                                texels, coarse, log_w - 1, log_h - 1, 0.5 * a, 0.5 * b
+                            )
                     lit = _lit(light, codes[i, 1], codes[i, 2], codes[i, 3], part_s, part_t)
                     value = albedo * faces[i, 5] * lit / (255.0 * samples)
                     if k == 0:
                         depth[row, column] = z
                         a, b = part_s * faces[i, 0], part_t * faces[i, 1]
-                        x0, y0 = _project(start, i, a, b, pinhole)
                         x1, y1 = _project(end, i, a, b, pinhole)
-                        flow[row, column, 0] = x1 - x0
-                        flow[row, column, 1] = y1 - y0
+                        flow[row, column, 0] = 2.0 * (x1 - x)
+                        flow[row, column, 1] = 2.0 * (y1 - y)
                 if k == 0:
                     own = value
-                    mixed = False
-                    for j in range(1, layers):
-                        mixed = mixed or ids[j, row, column] != centre
-                    if not mixed:
+                    if not mixed[row, column]:
                         total = value * (layers - 1)
                         break
                 else:

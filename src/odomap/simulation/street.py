@@ -81,8 +81,8 @@ def street(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     angle = rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.2)])
     lights = Lights(
-        0.55, 3.0, np.zeros((0, 3)), np.zeros(0),
-        sun=sun / np.linalg.norm(sun), sun_power=0.75, grid_m=0.6, open_rays=4,
+        0.75, 3.0, np.zeros((0, 3)), np.zeros(0),
+        sun=sun / np.linalg.norm(sun), sun_power=0.95, grid_m=0.8, open_rays=4,
     )  # fmt: skip
     builder = SceneBuilder(rng, lights, (0.8, 0.6))
     _ground(builder, road)
@@ -203,28 +203,39 @@ def _pavement(builder: SceneBuilder, road: _Road, side: float) -> None:
         builder.box(point, (stretch, 3.4, up), number, 130.0, axes=axes, gain=gain)
 
 
-def _car(builder: SceneBuilder, point: Array, axes: Array, texture: int, mover: int = -1) -> None:
+def _car(
+    builder: SceneBuilder, point: Array, axes: Array, textures: tuple[int, int], mover: int = -1
+) -> None:
     """Body and cabin; `point` is on the ground below the middle."""
     rng = builder.rng
     size = rng.uniform(0.92, 1.1, 3) * [4.2, 1.75, 0.95]
     gain = float(rng.uniform(0.5, 1.3))
     builder.box(
-        point + UP * (0.2 + size[2] / 2), tuple(size), texture, axes=axes, gain=gain, mover=mover
+        point + UP * (0.2 + size[2] / 2),
+        tuple(size),
+        textures[0],
+        axes=axes,
+        gain=gain,
+        mover=mover,
     )
     cabin = (size[0] * 0.5, size[1] * 0.88, 0.55)
     at = point + UP * (0.2 + size[2] + 0.275) - axes[:, 0] * 0.2
-    builder.box(at, cabin, texture, axes=axes, gain=gain * 0.8, mover=mover)
+    builder.box(at, cabin, textures[1], axes=axes, mover=mover)
+
+
+def _car_paint(builder: SceneBuilder) -> tuple[int, int]:
+    return builder.paint("car", 512, 128), builder.paint("cabin", 256, 64)
 
 
 def _cars(builder: SceneBuilder, road: _Road, side: float) -> None:
     """Cars parked along the kerb with gaps."""
     rng = builder.rng
-    paints = [builder.paint("car", 512, 128) for _ in range(4)]
+    paints = [_car_paint(builder) for _ in range(4)]
     along = float(rng.uniform(0, 20))
     while along < road.round_m - 6:
         if rng.random() < 0.55:
             point, axes = road.at(along, side * 4.05)
-            _car(builder, point, axes, int(rng.choice(paints)))
+            _car(builder, point, axes, paints[int(rng.integers(4))])
         along += float(rng.uniform(5.6, 14))
 
 
@@ -281,4 +292,4 @@ def _oncoming(builder: SceneBuilder, road: _Road, backwards: bool) -> None:
     route = closed_route(way if backwards else way[::-1])
     path = Path(route, rate, still[0], still[1], still[2], start=float(rng.uniform()))
     number = builder.mover(path)
-    _car(builder, np.zeros(3), np.eye(3), builder.paint("car", 512, 128), number)
+    _car(builder, np.zeros(3), np.eye(3), _car_paint(builder), number)

@@ -67,36 +67,31 @@ def fractal(
         rng: where the numbers come from.
         height: pixels, a power of two.
         width: pixels, a power of two.
-        cell: size of the coarsest grain in pixels.
+        cell: size of the coarsest grain in pixels, taken to the nearest power of two.
         octaves: how many halvings of it.
         persistence: amplitude ratio from one octave to the next.
 
     Returns:
         (height, width) float32 with zero mean and unit deviation.
     """
-    total = np.zeros((height, width), np.float32)
+    halvings = min(max(0, round(float(np.log2(cell)))), int(np.log2(min(height, width))) - 1)
+    shape = height >> halvings, width >> halvings
+    total = rng.standard_normal(shape, dtype=np.float32)
     amplitude = 1.0
-    for _ in range(octaves):
-        rows, columns = max(2, round(height / cell)), max(2, round(width / cell))
-        if rows >= height or columns >= width:
-            total += amplitude * rng.standard_normal((height, width), dtype=np.float32)
-            break
-        grid = rng.standard_normal((rows, columns), dtype=np.float32)
-        total += amplitude * _enlarge(grid, height, width)
-        amplitude *= persistence
-        cell *= 0.5
+    for octave in range(1, halvings + 1):
+        total = _doubled(total)
+        if octave < octaves:
+            amplitude *= persistence
+            total += np.float32(amplitude) * rng.standard_normal(total.shape, dtype=np.float32)
     scaled: Grey = (total - total.mean()) / max(float(total.std()), 1e-6)
     return scaled
 
 
-def _enlarge(grid: Grey, height: int, width: int) -> Grey:
-    """Interpolate a small periodic grid to full size (cubic), keeping it periodic."""
-    rows, columns = grid.shape
-    x = ((np.arange(width, dtype=np.float32) + 0.5) * (columns / width) + 1.5).astype(np.float32)
-    y = ((np.arange(height, dtype=np.float32) + 0.5) * (rows / height) + 1.5).astype(np.float32)
-    padded = np.pad(grid, 2, mode="wrap")
-    map_x, map_y = np.meshgrid(x, y)
-    return np.asarray(cv2.remap(padded, map_x, map_y, cv2.INTER_CUBIC), np.float32)
+def _doubled(image: Grey) -> Grey:
+    """Enlarge a periodic image by two (cubic), keeping it periodic."""
+    padded = np.pad(image, 2, mode="wrap")
+    large = cv2.resize(padded, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
+    return np.ascontiguousarray(large[4:-4, 4:-4], np.float32)
 
 
 def texture(kind: str, rng: Generator, width: int, height: int) -> Grey:
@@ -323,13 +318,14 @@ def _window(rng: Generator, image: Grey, x: float, y: float, w: float, h: float)
 
 
 def _car(rng: Generator, height: int, width: int) -> Grey:
-    """Side of a parked car: body, panes, doors, wheels, a highlight."""
+    """Side of a parked car: body, doors, wheels, a highlight."""
     tone = float(rng.uniform(0.08, 0.85))
     image: Grey = np.full((height, width), tone, np.float32)
     image += np.linspace(0.1, -0.1, height, dtype=np.float32)[:, None]
-    _rectangle(image, width * 0.08, height * 0.06, width * 0.84, height * 0.34, 0.1)
     for x in (0.3, 0.55, 0.75):
-        _rectangle(image, width * x, height * 0.02, width * 0.02, height * 0.75, tone * 0.6)
+        _rectangle(image, width * x, height * 0.02, width * 0.01, height * 0.75, tone * 0.5)
+        _rectangle(image, width * (x - 0.06), height * 0.3, width * 0.04, height * 0.07, tone * 1.4)
+    _rectangle(image, 0, height * 0.45, width, height * 0.04, tone * 0.7)
     _rectangle(image, 0, height * 0.82, width, height * 0.18, 0.06)
     for x in (0.2, 0.8):
         middle = (int(width * x), int(height * 0.8))
@@ -340,8 +336,18 @@ def _car(rng: Generator, height: int, width: int) -> Grey:
     return image
 
 
+def _cabin(rng: Generator, height: int, width: int) -> Grey:
+    """Windows of a car: dark panes with pillars between, the roof's edge above."""
+    image: Grey = np.full((height, width), float(rng.uniform(0.1, 0.7)), np.float32)
+    for x in (0.06, 0.38, 0.70):
+        _rectangle(image, width * x, height * 0.15, width * 0.26, height * 0.75, 0.08)
+    image += 0.04 * fractal(rng, height, width, width / 4, 6)
+    return image
+
+
 TEXTURES: dict[str, Callable[[Generator, int, int], Grey]] = {
     "asphalt": _asphalt,
+    "cabin": _cabin,
     "car": _car,
     "cardboard": _cardboard,
     "fabric": _fabric,

@@ -183,7 +183,7 @@ class World:
     ) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.float32] | None]:
         noise = ImageNoise().scaled(self.spec.noise)
         time, seed = self._seconds(index), self.spec.seed
-        times = time + noise.shutter_s * np.array([0.0, -0.5, 0.5])
+        times = time + noise.shutter_s * np.array([0.0, 0.5])
         Ts_world_imu = self._path.at(times).Ts_world_body
         images, depth = [], None
         for number, mount in enumerate(self._carried.cameras):
