@@ -1,3 +1,5 @@
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -129,6 +131,10 @@ def test_cameras_are_values():
     assert cam == camera("euroc")
     assert hash(cam) == hash(camera("euroc"))
     assert cam != camera("none")
+    again = pickle.loads(pickle.dumps(cam))
+    assert again == cam
+    assert not again.intrinsics.flags.writeable
+    assert eval(repr(cam)) == cam
     assert (cam.fx, cam.cy, cam.width, cam.height) == (458.654, 248.375, 752, 480)
     with pytest.raises(ValueError, match="read-only"):
         cam.intrinsics[0] = 1.0

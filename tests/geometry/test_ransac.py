@@ -99,6 +99,8 @@ def test_samples_needed_is_the_textbooks():
     assert samples_needed(1.0, 5, 0.99, 10000) == 1
     assert samples_needed(0.0, 5, 0.99, 10000) == 10000
     assert samples_needed(0.1, 8, 0.99, 500) == 500
+    assert samples_needed(1e-6, 5, 0.99, 500) == 500
+    assert samples_needed(1e-3, 4, 0.99, 10**15) == pytest.approx(4.605e12, rel=1e-3)
 
 
 @pytest.mark.parametrize(

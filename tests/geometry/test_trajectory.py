@@ -1,3 +1,5 @@
+import pickle
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,9 @@ def test_what_it_says_of_itself():
     assert p == Trajectory(p.stamps_ns, p.Ts_world_body)
     assert p != path(seed=2)
     assert p != path(covariances=True)
+    again = pickle.loads(pickle.dumps(path(covariances=True)))
+    assert again == path(covariances=True)
+    assert not again.Ts_world_body.flags.writeable
     assert "20 poses, 0.950 s" in repr(p)
     assert p.pose(3) == SE3(p.Ts_world_body[3])
     with pytest.raises(ValueError, match="read-only"):

@@ -148,7 +148,7 @@ MODELS: Mapping[str, LensModel] = MappingProxyType({"pinhole": RadialTangential(
 """Lens models by the name they have in a rig file."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Camera:
     """A calibrated camera: lens model, intrinsics, distortion, and image size.
 
@@ -207,6 +207,13 @@ class Camera:
     def __hash__(self) -> int:
         numbers = (*self.intrinsics.tolist(), *self.distortion.tolist())
         return hash((self.model, self.resolution, numbers))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Camera, (self.model, self.intrinsics, self.distortion, self.resolution)
+
+    def __repr__(self) -> str:
+        intrinsics, distortion = self.intrinsics.tolist(), self.distortion.tolist()
+        return f"Camera('{self.model}', {intrinsics}, {distortion}, {self.resolution})"
 
     @property
     def fx(self) -> float:

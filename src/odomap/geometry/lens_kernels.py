@@ -82,4 +82,6 @@ def radtan_undistort_rows(plane: Array, d: Array, reach: float, out: Array) -> N
 def warm_up() -> None:
     """Compile the kernels of this file."""
     plane, d = np.zeros((1, 2)), np.zeros(8)
+    radtan_distort(0.1, 0.1, d)
+    radtan_undistort(0.1, 0.1, d, np.inf)
     radtan_undistort_rows(plane, d, np.inf, np.empty_like(plane))

@@ -215,6 +215,8 @@ def warm_up() -> None:
     """Compile the kernels of this file."""
     R, t, xi = np.eye(3), np.zeros(3), np.zeros(6)
     R_out, t_out, phi = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    stumpff_123(0.1)
+    half_cot(0.1)
     so3_exp_into(phi, R_out)
     so3_right_jacobian_into(phi, R_out)
     so3_left_jacobian_inverse_into(phi, R_out)

@@ -287,7 +287,8 @@ def search_pose(
             clean = (_copy_marks(inliers, inliers) / n) ** 3
             if clean >= 1.0:
                 return trial + 1
-            needed = min(samples.shape[0], int(np.log(1.0 - confidence) / np.log(1.0 - clean)) + 1)
+            if clean > 1e-12:
+                needed = min(needed, int(np.log(1.0 - confidence) / np.log1p(-clean)) + 1)
     return int(samples.shape[0])
 
 
@@ -298,6 +299,10 @@ def warm_up() -> None:
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     slopes = np.tile(np.eye(2), (4, 1, 1))
     samples, inliers = np.array([[0, 1, 2]]), np.zeros(4, dtype=np.bool_)
-    R, t = np.eye(3), np.zeros(3)
+    R, t, H, g = np.eye(3), np.zeros(3), np.zeros((6, 6)), np.zeros(6)
+    data, weights = (points, plane, slopes), np.ones(4)
+    score_pose(R, t, *data, 1e-4, inliers)
+    gather_pose(R, t, *data, weights, 1.0, H, g)
+    cholesky_solve(np.eye(6), g, np.zeros(6))
     search_pose(samples, points, rays, plane, slopes, 1e-4, 0.99, 4, R, t, inliers)
-    refine_pose_into(R, t, points, plane, slopes, np.ones(4), 1.0, 2, np.zeros((6, 6)))
+    refine_pose_into(R, t, *data, weights, 1.0, 2, H)

@@ -16,7 +16,7 @@ Reference: O. Chum, J. Matas, J. Kittler, "Locally optimized RANSAC", DAGM 2003.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, log
+from math import ceil, log, log1p
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -91,9 +91,9 @@ def samples_needed(inlier_share: float, sample_size: int, confidence: float, lim
     clean = inlier_share**sample_size
     if clean >= 1.0:
         return 1
-    if clean <= 0.0:
+    if clean < 1e-12:
         return limit
-    return max(1, min(limit, ceil(log(1.0 - confidence) / log(1.0 - clean))))
+    return max(1, min(limit, ceil(log(1.0 - confidence) / log1p(-clean))))
 
 
 def ransac(

@@ -106,6 +106,9 @@ class Trajectory:
 
     __hash__ = None  # type: ignore[assignment]
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return Trajectory, (self.stamps_ns, self.Ts_world_body, self.covariances)
+
     def __repr__(self) -> str:
         if not len(self):
             return "Trajectory(empty)"
