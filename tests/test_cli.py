@@ -168,6 +168,57 @@ def test_bug_is_one_line_too_and_debug_shows_where(cli, monkeypatch, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_a_reader_that_leaves_is_no_error():
+    code = "import sys; from odomap.cli import main; sys.exit(main(['config']))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    with process.stderr as complaints:
+        assert complaints.read() == b""
+    assert process.wait(60) == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_stdout_on_a_full_disk_is_one_line():
+    code = "import sys; from odomap.cli import main; sys.exit(main(['config']))"
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert result.returncode == 1
+    assert result.stderr.startswith("odomap: No space left on device\n")
+    assert "Traceback" not in result.stderr
+
+
+def test_progress_is_plain_lines_in_a_pipe(capsys, monkeypatch):
+    from odomap.cli import progress
+
+    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.0)
+    with progress.Steps("compiling") as steps:
+        steps.show(1, 3, "odomap.a")
+    with progress.Steps("compiling", quiet=True) as steps:
+        steps.show(2, 3, "odomap.b")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == "compiling 1/3  odomap.a\n"
+
+
+def test_progress_of_a_run_says_rate_and_status(capsys, monkeypatch):
+    from odomap.cli import progress
+    from odomap.geometry.pose import SE3
+    from odomap.maps.estimate import Estimate, Status
+    from odomap.run import Progress
+
+    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.0)
+    pose = SE3.identity()
+    lost = Estimate(7, 0, Status.LOST, "too dark", 0, pose, pose, np.eye(6), 3)
+    with progress.TrackingProgress() as shown:
+        shown.show(Progress("tracking", 8, 20, lost, 31.26))
+    line = capsys.readouterr().err
+    assert line == "tracking 8/20   31.3 fps  lost  3 inliers  too dark\n"
+
+
 # ---- config ----
 
 

@@ -40,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OdomapError as error:
         return _fail(" ".join(str(error).split()), error.exit_code)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{place}{error.strerror or error}", 1)
     except MemoryError:
         return _fail("out of memory", 1)
     except Exception as error:  # the last resort: a bug is said in one line, too
