@@ -49,7 +49,9 @@ _SERIES = np.array(
     [[(-1) ** m / factorial(2 * m + k) for m in range(_TERMS)] for k in range(6)], dtype=np.float64
 )
 
-_COT_SERIES = np.array([1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000])
+_COT_SERIES = np.array(
+    [[1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000]]
+)
 """(1 - x/2 cot x/2) / x² in powers of x²: |B_2m| / (2m)!."""
 
 
@@ -99,17 +101,18 @@ def stumpff(theta2: ArrayLike) -> tuple[Array, Array, Array, Array, Array, Array
     c4 = (0.5 - c2) / big
     c5 = (1.0 / 6.0 - c3) / big
     if np.any(small):
-        c3 = np.where(small, _horner(near, _SERIES[3]), c3)
-        c4 = np.where(small, _horner(near, _SERIES[4]), c4)
-        c5 = np.where(small, _horner(near, _SERIES[5]), c5)
+        series = _power_series(near, _SERIES[3:])
+        c3 = np.where(small, series[..., 0], c3)
+        c4 = np.where(small, series[..., 1], c4)
+        c5 = np.where(small, series[..., 2], c5)
     return np.cos(theta), c1, c2, c3, c4, c5
 
 
-def _horner(x: Array, coefficients: Array) -> Array:
-    total = np.full_like(x, coefficients[-1])
-    for c in coefficients[-2::-1]:
-        total = total * x + c
-    return total
+def _power_series(x: Array, coefficients: Array) -> Array:
+    """Sum K series (K, terms) at x (...) to (..., K) in few calls: x is often one number."""
+    powers = np.ones((*x.shape, coefficients.shape[1]))
+    powers[..., 1:] = x[..., None]
+    return np.asarray(np.multiply.accumulate(powers, axis=-1) @ coefficients.T)
 
 
 def half_cot(theta2: ArrayLike) -> Array:
@@ -118,7 +121,9 @@ def half_cot(theta2: ArrayLike) -> Array:
     small = x < 0.04
     theta = np.sqrt(np.where(small, 1.0, x))
     far = (1.0 - 0.5 * theta * np.cos(0.5 * theta) / np.sin(0.5 * theta)) / (theta * theta)
-    return np.where(small, _horner(np.where(small, x, 0.0), _COT_SERIES), far)
+    if not np.any(small):
+        return np.asarray(far)
+    return np.where(small, _power_series(np.where(small, x, 0.0), _COT_SERIES)[..., 0], far)
 
 
 def hat(phi: ArrayLike) -> Array:

@@ -96,18 +96,18 @@ def _refined(
     views: Array, x: Array, weight: Array, points: Array, iterations: int
 ) -> tuple[Array, Array]:
     """Take damped Gauss-Newton steps, each point by itself; return the points and their cost."""
-    cost = _linearised(views, x, weight, points)[0]
-    damping = np.full(points.shape[0], 1e-6)
+    cost, H, g = _linearised(views, x, weight, points)
+    damping = np.full(len(points), 1e-6)
     for _ in range(iterations):
-        _, H, g = _linearised(views, x, weight, points)
-        H = H + damping[:, None, None] * (np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3))
-        H[~np.isfinite(H).all(axis=(1, 2)) | (np.linalg.det(H) == 0)] = np.eye(3)
-        moved = points - np.linalg.solve(H, g[..., None])[..., 0]
-        new_cost = _linearised(views, x, weight, moved)[0]
+        lift = damping * np.trace(H, axis1=1, axis2=2)
+        A = H + lift[:, None, None] * np.eye(3)
+        A[~(np.abs(np.linalg.det(A)) > 0)] = np.eye(3)
+        moved = points - np.linalg.solve(A, g[..., None])[..., 0]
+        new_cost, new_H, new_g = _linearised(views, x, weight, moved)
         # Rays that meet behind a camera (infinite cost) are left there: no step makes them true.
         better = (new_cost <= cost) & np.isfinite(cost)
-        points = np.where(better[:, None], moved, points)
-        cost = np.where(better, new_cost, cost)
+        points, cost = np.where(better[:, None], moved, points), np.where(better, new_cost, cost)
+        H, g = np.where(better[:, None, None], new_H, H), np.where(better[:, None], new_g, g)
         damping = np.where(better, 0.1 * damping, 1e3 * damping)
     return points, cost
 
