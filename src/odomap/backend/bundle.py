@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.cholesky import factor, invert, solve
-from odomap.backend.schur import back_substitute, reduced_system, robust_cost
+from odomap.backend.schur import (
+    CameraArrays,
+    PoseArrays,
+    SightArrays,
+    SystemArrays,
+    back_substitute,
+    reduced_system,
+    robust_cost,
+)
 from odomap.errors import InputError
 from odomap.geometry.lie_kernels import se3_retract
 from odomap.kernels import kernel
@@ -134,56 +142,60 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
     if not bundle.is_fixed.any():
         raise InputError("bundle: hold at least one pose fixed, or the whole scene can drift")
     order = np.argsort(bundle.point, kind="stable")
-    start = np.searchsorted(bundle.point[order], np.arange(len(bundle.points_world) + 1)).astype(
-        np.int64
-    )
-    column = np.where(bundle.is_fixed, -1, np.cumsum(~bundle.is_fixed) - 1).astype(np.int64)
     free = int((~bundle.is_fixed).sum())
-    Rs = np.ascontiguousarray(bundle.Ts_world_body[:, :3, :3])
-    ts = np.ascontiguousarray(bundle.Ts_world_body[:, :3, 3])
+    poses, cameras, seen = _arrays(bundle, order)
     points = np.array(bundle.points_world, np.float64, order="C")
     chi2, joint, costs = np.empty(len(order)), np.zeros((6 * free, 6 * free)), np.zeros(2)
     tried, why = _solve_kernel(
-        Rs,
-        ts,
-        column,
+        poses,
         points,
-        np.ascontiguousarray(bundle.Ts_camera_body[:, :3, :3]),
-        np.ascontiguousarray(bundle.Ts_camera_body[:, :3, 3]),
-        np.asarray(bundle.baselines, np.float64),
-        start,
-        bundle.pose[order],
-        bundle.camera[order],
-        np.ascontiguousarray(bundle.xy[order]),
-        bundle.disparity[order],
-        np.ascontiguousarray(bundle.weights[order]),
-        config.huber_width,
-        config.iterations,
-        config.tolerance,
+        cameras,
+        seen,
+        (config.huber_width, config.iterations, config.tolerance),
         chi2,
         joint,
         costs,
     )
     Ts = np.array(bundle.Ts_world_body)
-    Ts[:, :3, :3], Ts[:, :3, 3] = Rs, ts
+    Ts[:, :3, :3], Ts[:, :3, 3] = poses.R, poses.t
     covariances = np.zeros((len(Ts), 6, 6))
-    for k in np.flatnonzero(column >= 0):
-        f = 6 * column[k]
+    for k in np.flatnonzero(poses.column >= 0):
+        f = 6 * poses.column[k]
         covariances[k] = joint[f : f + 6, f : f + 6]
     unsorted = np.empty(len(order))
     unsorted[order] = chi2
+    factor = _variance_factor(bundle, unsorted, config.huber_width, free)
     return BundleSolution(
-        Ts,
-        points,
-        costs[0],
-        costs[1],
-        tried,
-        REASONS[why],
-        unsorted,
-        covariances,
-        joint,
-        _variance_factor(bundle, unsorted, config.huber_width, free),
+        Ts, points, costs[0], costs[1], tried, REASONS[why], unsorted, covariances, joint, factor
     )
+
+
+def _arrays(bundle: Bundle, order: Index) -> tuple[PoseArrays, CameraArrays, SightArrays]:
+    """Lay a bundle out as the kernels want it, observations sorted by landmark."""
+    column = np.where(bundle.is_fixed, -1, np.cumsum(~bundle.is_fixed) - 1).astype(np.int64)
+    Ts, mounts = bundle.Ts_world_body, bundle.Ts_camera_body
+    start = np.searchsorted(bundle.point[order], np.arange(len(bundle.points_world) + 1))
+    return (
+        PoseArrays(_contiguous(Ts[:, :3, :3]), _contiguous(Ts[:, :3, 3]), column),
+        CameraArrays(
+            _contiguous(mounts[:, :3, :3]),
+            _contiguous(mounts[:, :3, 3]),
+            _contiguous(bundle.baselines),
+        ),
+        SightArrays(
+            start.astype(np.int64),
+            bundle.pose[order].astype(np.int64),
+            bundle.camera[order].astype(np.int64),
+            _contiguous(bundle.xy[order]),
+            _contiguous(bundle.disparity[order]),
+            _contiguous(bundle.weights[order]),
+        ),
+    )
+
+
+def _contiguous(values: Array) -> Array:
+    """Return a fresh, writable copy, rows together in memory."""
+    return np.array(values, np.float64, order="C")
 
 
 def _variance_factor(bundle: Bundle, chi2: Array, width: float, free: int) -> float:
@@ -194,115 +206,55 @@ def _variance_factor(bundle: Bundle, chi2: Array, width: float, free: int) -> fl
 
 
 @kernel
-def _retract(
-    Rs: Array, ts: Array, column: Index, step: Array, Rs_new: Array, ts_new: Array
-) -> None:
+def _retract(poses: PoseArrays, step: Array, R_new: Array, t_new: Array) -> None:
     """T ← T exp(δξ) for the free poses."""
-    for i in range(len(Rs)):
-        f = 6 * column[i]
+    for i in range(len(poses.R)):
+        f = 6 * poses.column[i]
         if f < 0:
-            Rs_new[i], ts_new[i] = Rs[i], ts[i]
+            R_new[i], t_new[i] = poses.R[i], poses.t[i]
         else:
-            se3_retract(Rs[i], ts[i], step[f : f + 6], Rs_new[i], ts_new[i])
+            se3_retract(poses.R[i], poses.t[i], step[f : f + 6], R_new[i], t_new[i])
 
 
 @kernel
 def _solve_kernel(
-    Rs: Array,
-    ts: Array,
-    column: Index,
+    poses: PoseArrays,
     points: Array,
-    Rs_cb: Array,
-    ts_cb: Array,
-    baselines: Array,
-    start: Index,
-    pose: Index,
-    camera: Index,
-    xy: Array,
-    disparity: Array,
-    weights: Array,
-    width: float,
-    iterations: int,
-    tolerance: float,
+    cameras: CameraArrays,
+    seen: SightArrays,
+    limits: tuple[float, int, float],
     chi2: Array,
     joint: Array,
     costs: Array,
 ) -> tuple[int, int]:
-    """Levenberg-Marquardt, Rs, ts and points in place; returns steps tried and a reason's index."""
+    """Levenberg-Marquardt, poses and points in place; returns steps tried and a reason's index."""
+    width, iterations, tolerance = limits
     size = len(joint)
-    S, s = np.empty((size, size)), np.empty(size)
-    W = np.empty((len(pose), 6, 3))
-    C_inverse, c = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    Rs_new, ts_new, moved = np.empty_like(Rs), np.empty_like(ts), np.empty_like(points)
-    cost = robust_cost(
-        Rs,
-        ts,
-        points,
-        Rs_cb,
-        ts_cb,
-        baselines,
-        start,
-        pose,
-        camera,
-        xy,
-        disparity,
-        weights,
-        width,
-        chi2,
+    system = SystemArrays(
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty((len(seen.pose), 6, 3)),
+        np.empty((len(points), 3, 3)),
+        np.empty((len(points), 3)),
     )
+    moved = np.empty_like(points)
+    trial_poses = PoseArrays(np.empty_like(poses.R), np.empty_like(poses.t), poses.column)
+    cost = robust_cost(poses, points, cameras, seen, width, chi2)
     costs[0] = cost
     damping, grow = 1e-5, 4.0
     reason, tried = 0, 0
     while tried < iterations:
         tried += 1
-        reduced_system(
-            Rs,
-            ts,
-            column,
-            points,
-            Rs_cb,
-            ts_cb,
-            baselines,
-            start,
-            pose,
-            camera,
-            xy,
-            disparity,
-            weights,
-            width,
-            damping,
-            S,
-            s,
-            W,
-            C_inverse,
-            c,
-        )
-        if factor(S):
-            for a in range(size):
-                s[a] = -s[a]
-            solve(S, s)
-            _retract(Rs, ts, column, s, Rs_new, ts_new)
-            back_substitute(column, start, pose, W, C_inverse, c, s, points, moved)
-            trial = robust_cost(
-                Rs_new,
-                ts_new,
-                moved,
-                Rs_cb,
-                ts_cb,
-                baselines,
-                start,
-                pose,
-                camera,
-                xy,
-                disparity,
-                weights,
-                width,
-                chi2,
-            )
-        else:
-            trial = np.inf
+        reduced_system(poses, points, cameras, seen, width, damping, system)
+        trial = np.inf
+        if factor(system.S):
+            system.s[:] = -system.s
+            solve(system.S, system.s)
+            _retract(poses, system.s, trial_poses.R, trial_poses.t)
+            back_substitute(poses, seen, system, points, moved)
+            trial = robust_cost(trial_poses, moved, cameras, seen, width, chi2)
         if trial < cost:
-            Rs[:], ts[:], points[:] = Rs_new, ts_new, moved
+            poses.R[:], poses.t[:], points[:] = trial_poses.R, trial_poses.t, moved
             small = cost - trial < tolerance * cost
             cost, damping, grow = trial, max(0.2 * damping, 1e-9), 4.0
             if small:
@@ -313,46 +265,10 @@ def _solve_kernel(
                 reason = 2
                 break
             damping, grow = max(damping, 1e-5) * grow, 2.0 * grow
-    costs[1] = robust_cost(
-        Rs,
-        ts,
-        points,
-        Rs_cb,
-        ts_cb,
-        baselines,
-        start,
-        pose,
-        camera,
-        xy,
-        disparity,
-        weights,
-        width,
-        chi2,
-    )
-    reduced_system(
-        Rs,
-        ts,
-        column,
-        points,
-        Rs_cb,
-        ts_cb,
-        baselines,
-        start,
-        pose,
-        camera,
-        xy,
-        disparity,
-        weights,
-        width,
-        0.0,
-        S,
-        s,
-        W,
-        C_inverse,
-        c,
-    )
-    if factor(S):
-        invert(S, joint)
+    costs[1] = robust_cost(poses, points, cameras, seen, width, chi2)
+    reduced_system(poses, points, cameras, seen, width, 0.0, system)
+    if factor(system.S):
+        invert(system.S, joint)
     else:
         reason = 3
     return tried, reason

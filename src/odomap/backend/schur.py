@@ -15,16 +15,64 @@ Cost: O(observations) to linearise, O(Σ n²) to eliminate, O(poses³) to solve.
 Reference: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999, section 6.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.residuals import huber_cost, huber_weight, reproject, reproject_with_jacobians
 from odomap.kernels import kernel
 
-__all__ = ["back_substitute", "reduced_system", "robust_cost", "warm_up"]
+__all__ = [
+    "CameraArrays",
+    "PoseArrays",
+    "SightArrays",
+    "SystemArrays",
+    "back_substitute",
+    "reduced_system",
+    "robust_cost",
+    "warm_up",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+class PoseArrays(NamedTuple):
+    """Poses of bodies: R (K, 3, 3), t (K, 3), and column (K,), the block in S or −1 if fixed."""
+
+    R: Array
+    t: Array
+    column: Index
+
+
+class CameraArrays(NamedTuple):
+    """Cameras on the body, T_camera_body: R (C, 3, 3), t (C, 3), and baseline (C,)."""
+
+    R: Array
+    t: Array
+    baseline: Array
+
+
+class SightArrays(NamedTuple):
+    """Observations sorted by landmark: those of landmark m are start[m] to start[m + 1]."""
+
+    start: Index
+    pose: Index
+    camera: Index
+    xy: Array
+    disparity: Array
+    weight: Array
+
+
+class SystemArrays(NamedTuple):
+    """The reduced system S (6F, 6F), s = a − W C⁻¹ c, and what back-substitution needs."""
+
+    S: Array
+    s: Array
+    W: Array
+    C_inverse: Array
+    c: Array
 
 
 @kernel(reorder=True)
@@ -48,54 +96,37 @@ def invert_3x3(C: Array, inverse: Array) -> bool:
 
 @kernel(reorder=True)
 def reduced_system(
-    Rs: Array,
-    ts: Array,
-    column: Index,
+    poses: PoseArrays,
     points: Array,
-    Rs_cb: Array,
-    ts_cb: Array,
-    baselines: Array,
-    start: Index,
-    pose: Index,
-    camera: Index,
-    xy: Array,
-    disparity: Array,
-    weights: Array,
+    cameras: CameraArrays,
+    seen: SightArrays,
     width: float,
     damping: float,
-    S: Array,
-    s: Array,
-    W: Array,
-    C_inverse: Array,
-    c: Array,
+    system: SystemArrays,
 ) -> float:
-    """Write S (6F, 6F), s = a − W C⁻¹ c, and what back-substitution needs; return the robust cost.
-
-    `column` maps a pose to its block in S, −1 if it is held fixed; `start` (M + 1) delimits each
-    landmark's observations.
-    """
+    """Fill `system` at the given poses and landmarks; return the robust cost."""
     r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
-    C, WC, diagonal = np.empty((3, 3)), np.empty((6, 3)), np.zeros(len(s))
+    C, WC, diagonal = np.empty((3, 3)), np.empty((6, 3)), np.zeros(len(system.s))
+    S, s, W, c = system.S, system.s, system.W, system.c
     S[:, :] = 0.0
     s[:] = 0.0
     cost = 0.0
     for m in range(len(points)):
         C[:, :] = 0.0
-        for k in range(3):
-            c[m, k] = 0.0
-        for o in range(start[m], start[m + 1]):
-            i, cam, f = pose[o], camera[o], column[pose[o]]
+        c[m, :] = 0.0
+        for o in range(seen.start[m], seen.start[m + 1]):
+            i, k, f = seen.pose[o], seen.camera[o], poses.column[seen.pose[o]]
             W[o, :, :] = 0.0
             if not reproject_with_jacobians(
-                Rs[i],
-                ts[i],
-                Rs_cb[cam],
-                ts_cb[cam],
-                baselines[cam],
+                poses.R[i],
+                poses.t[i],
+                cameras.R[k],
+                cameras.t[k],
+                cameras.baseline[k],
                 points[m],
-                xy[o],
-                disparity[o],
-                weights[o],
+                seen.xy[o],
+                seen.disparity[o],
+                seen.weight[o],
                 r,
                 J,
                 P,
@@ -111,108 +142,71 @@ def reduced_system(
             if f < 0:
                 continue
             for a in range(6):
-                s[6 * f + a] += w * (J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2])
+                j0, j1, j2 = w * J[0, a], w * J[1, a], w * J[2, a]
+                s[6 * f + a] += j0 * r[0] + j1 * r[1] + j2 * r[2]
                 for b in range(6):
-                    S[6 * f + a, 6 * f + b] += w * (
-                        J[0, a] * J[0, b] + J[1, a] * J[1, b] + J[2, a] * J[2, b]
-                    )
+                    S[6 * f + a, 6 * f + b] += j0 * J[0, b] + j1 * J[1, b] + j2 * J[2, b]
                 for b in range(3):
-                    W[o, a, b] = w * (J[0, a] * P[0, b] + J[1, a] * P[1, b] + J[2, a] * P[2, b])
-                diagonal[6 * f + a] += w * (J[0, a] ** 2 + J[1, a] ** 2 + J[2, a] ** 2)
+                    W[o, a, b] = j0 * P[0, b] + j1 * P[1, b] + j2 * P[2, b]
+                diagonal[6 * f + a] += j0 * J[0, a] + j1 * J[1, a] + j2 * J[2, a]
         for a in range(3):
             C[a, a] *= 1.0 + damping
-        if not invert_3x3(C, C_inverse[m]):
+        if not invert_3x3(C, system.C_inverse[m]):
             # A direction that no observation constrains: hold the landmark in this step.
-            C_inverse[m, :, :] = 0.0
-        _eliminate(column, start[m], start[m + 1], pose, W, C_inverse[m], c[m], WC, S, s)
+            system.C_inverse[m, :, :] = 0.0
+        _eliminate(poses.column, seen, m, system, WC)
     for a in range(len(s)):
         S[a, a] += damping * diagonal[a] + 1e-12
     return cost
 
 
 @kernel(reorder=True)
-def _eliminate(
-    column: Index,
-    first: int,
-    last: int,
-    pose: Index,
-    W: Array,
-    C_inverse: Array,
-    c: Array,
-    WC: Array,
-    S: Array,
-    s: Array,
-) -> None:
-    """S_ij −= W_i C⁻¹ W_jᵀ and s_i −= W_i C⁻¹ c for all pairs of observations of one landmark."""
-    for o in range(first, last):
-        f = 6 * column[pose[o]]
+def _eliminate(column: Index, seen: SightArrays, m: int, system: SystemArrays, WC: Array) -> None:
+    """S_ij −= W_i C⁻¹ W_jᵀ and s_i −= W_i C⁻¹ c for all pairs of observations of landmark m."""
+    S, s, W, C, c = system.S, system.s, system.W, system.C_inverse[m], system.c[m]
+    for o in range(seen.start[m], seen.start[m + 1]):
+        f = 6 * column[seen.pose[o]]
         if f < 0:
             continue
         for a in range(6):
             for b in range(3):
-                WC[a, b] = (
-                    W[o, a, 0] * C_inverse[0, b]
-                    + W[o, a, 1] * C_inverse[1, b]
-                    + W[o, a, 2] * C_inverse[2, b]
-                )
+                WC[a, b] = W[o, a, 0] * C[0, b] + W[o, a, 1] * C[1, b] + W[o, a, 2] * C[2, b]
             s[f + a] -= WC[a, 0] * c[0] + WC[a, 1] * c[1] + WC[a, 2] * c[2]
-        for other in range(first, last):
-            g = 6 * column[pose[other]]
+        for q in range(seen.start[m], seen.start[m + 1]):
+            g = 6 * column[seen.pose[q]]
             if g < 0 or g > f:  # the lower triangle is enough
                 continue
             for a in range(6):
+                x, y, z = WC[a, 0], WC[a, 1], WC[a, 2]
                 for b in range(6):
-                    S[f + a, g + b] -= (
-                        WC[a, 0] * W[other, b, 0]
-                        + WC[a, 1] * W[other, b, 1]
-                        + WC[a, 2] * W[other, b, 2]
-                    )
+                    S[f + a, g + b] -= x * W[q, b, 0] + y * W[q, b, 1] + z * W[q, b, 2]
 
 
 @kernel(reorder=True)
 def back_substitute(
-    column: Index,
-    start: Index,
-    pose: Index,
-    W: Array,
-    C_inverse: Array,
-    c: Array,
-    step: Array,
-    points: Array,
-    moved: Array,
+    poses: PoseArrays, seen: SightArrays, system: SystemArrays, points: Array, moved: Array
 ) -> None:
-    """Write the moved landmarks p − C⁻¹ (c + Wᵀ δξ), given step = δξ (6F,)."""
-    b = np.empty(3)
+    """Write the moved landmarks p − C⁻¹ (c + Wᵀ δξ), where `system.s` holds δξ (6F,)."""
+    b, C = np.empty(3), system.C_inverse
     for m in range(len(points)):
-        for k in range(3):
-            b[k] = c[m, k]
-        for o in range(start[m], start[m + 1]):
-            f = 6 * column[pose[o]]
+        b[:] = system.c[m]
+        for o in range(seen.start[m], seen.start[m + 1]):
+            f = 6 * poses.column[seen.pose[o]]
             if f < 0:
                 continue
             for k in range(3):
                 for a in range(6):
-                    b[k] += W[o, a, k] * step[f + a]
+                    b[k] += system.W[o, a, k] * system.s[f + a]
         for k in range(3):
-            moved[m, k] = points[m, k] - (
-                C_inverse[m, k, 0] * b[0] + C_inverse[m, k, 1] * b[1] + C_inverse[m, k, 2] * b[2]
-            )
+            moved[m, k] = points[m, k] - (C[m, k, 0] * b[0] + C[m, k, 1] * b[1] + C[m, k, 2] * b[2])
 
 
 @kernel(reorder=True)
 def robust_cost(
-    Rs: Array,
-    ts: Array,
+    poses: PoseArrays,
     points: Array,
-    Rs_cb: Array,
-    ts_cb: Array,
-    baselines: Array,
-    start: Index,
-    pose: Index,
-    camera: Index,
-    xy: Array,
-    disparity: Array,
-    weights: Array,
+    cameras: CameraArrays,
+    seen: SightArrays,
     width: float,
     chi2: Array,
 ) -> float:
@@ -220,18 +214,18 @@ def robust_cost(
     r = np.empty(3)
     cost = 0.0
     for m in range(len(points)):
-        for o in range(start[m], start[m + 1]):
-            i, cam = pose[o], camera[o]
+        for o in range(seen.start[m], seen.start[m + 1]):
+            i, k = seen.pose[o], seen.camera[o]
             in_front = reproject(
-                Rs[i],
-                ts[i],
-                Rs_cb[cam],
-                ts_cb[cam],
-                baselines[cam],
+                poses.R[i],
+                poses.t[i],
+                cameras.R[k],
+                cameras.t[k],
+                cameras.baseline[k],
                 points[m],
-                xy[o],
-                disparity[o],
-                weights[o],
+                seen.xy[o],
+                seen.disparity[o],
+                seen.weight[o],
                 r,
             )
             chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if in_front else np.inf

@@ -10,7 +10,7 @@ Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Mo
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,36 @@ from odomap.vision.features import Corners, FeatureConfig, describe, detect
 from odomap.vision.flow import FlowConfig, pyramid, track
 from odomap.vision.matching import MatchConfig, match_guided
 
-__all__ = ["Association", "DescriptorAssociation", "FlowAssociation", "Reference", "View"]
+__all__ = [
+    "Association",
+    "DescriptorAssociation",
+    "FlowAssociation",
+    "Reference",
+    "TrackingConfig",
+    "View",
+]
 
 Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """How frames are placed and when one becomes a keyframe."""
+
+    association: Literal["flow", "descriptors"] = "flow"
+    """flow: patches followed by optical flow; descriptors: features matched in every frame."""
+    min_inliers: int = 15
+    """Observations that must agree with a pose for it to count as tracked."""
+    keyframe_ratio: float = 0.7
+    """A keyframe is made when fewer than this fraction of the last one's landmarks are tracked."""
+    keyframe_motion: float = 0.04
+    """A keyframe is made when points have moved by this fraction of the image width (median)."""
+    keyframe_interval: int = 20
+    """A keyframe is made after this many frames in any case."""
+    patience: int = 5
+    """Frames that may be lost before odometry starts anew."""
+    max_prediction_s: float = 0.3
+    """Velocity is trusted for this long; after a longer gap it is not extrapolated further."""
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from odomap.backend.bundle import BundleConfig
 from odomap.errors import ConfigError, nearest_name
-from odomap.system.mapping import StereoNoise, WindowConfig
-from odomap.system.tracking import TrackingConfig
+from odomap.system.association import (
+    Association,
+    DescriptorAssociation,
+    FlowAssociation,
+    TrackingConfig,
+)
+from odomap.system.mapping import WindowConfig
 from odomap.vision.features import FeatureConfig
 from odomap.vision.flow import FlowConfig
 from odomap.vision.matching import MatchConfig
-from odomap.vision.stereo import StereoConfig
+from odomap.vision.stereo import StereoConfig, StereoNoise
 
-__all__ = ["PRESETS", "Config", "preset"]
+__all__ = ["PRESETS", "Config", "make_association", "preset"]
 
 
 @dataclass(frozen=True)
@@ -74,3 +82,15 @@ def preset(name: str) -> Config:
             f"preset '{name}' is unknown{nearest_name(name, PRESETS)}; there are: {known}"
         )
     return PRESETS[name]()
+
+
+def make_association(config: Config, mask: NDArray[np.bool_]) -> Association:
+    """Return the association that a configuration asks for.
+
+    Args:
+        config: the configuration.
+        mask: (H, W) where the image holds something.
+    """
+    if config.tracking.association == "flow":
+        return FlowAssociation(config.features, config.flow, mask)
+    return DescriptorAssociation(config.features, config.matching, mask)

@@ -23,6 +23,11 @@ from odomap.vision.stereo import match_sparse, sgbm_disparity
 __all__ = ["StereoKeyframes"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Image = NDArray[np.uint8]
+
+MIN_DISPARITY_PX = 0.05
+"""Below this a point is at infinity as far as the pair can tell, and has no depth."""
 
 
 class StereoKeyframes:
@@ -44,10 +49,10 @@ class StereoKeyframes:
     def make(
         self,
         view: View,
-        right: NDArray[np.uint8],
+        right: Image,
         T_world_body: Array,
         tracked: Reference | None,
-        rows: NDArray[np.int64],
+        rows: Index,
         pixels: Array,
         covariance: Array,
     ) -> Reference:
@@ -65,68 +70,70 @@ class StereoKeyframes:
         Returns:
             The keyframe as the tracker needs it.
         """
-        landmark_ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
-        pixels, first_keyframe, first_keypoint = self._first(
-            view, T_world_body, tracked, rows, pixels
-        )
-        fresh, described = self._association.extend(
-            view, pixels, self._config.features.count - len(pixels)
-        )
-        keypoints = np.concatenate([pixels, fresh])
-        expected = self._expected_disparity(T_world_body, landmark_ids)
-        disparity = self._disparity(view, right, keypoints, expected)
-        depth = (
-            self._rectifier.camera.fx
-            * self._rectifier.baseline
-            / np.where(disparity > 0.05, disparity, np.nan)
-        )
-        # Keep what is tracked, and of what is new only what has depth.
-        keep = np.concatenate([np.ones(len(pixels), np.bool_), np.isfinite(depth[len(pixels) :])])
-        descriptors = np.concatenate([self._association.descriptors_at(view, pixels), described])[
-            keep
-        ]
-        keypoints, depth = keypoints[keep], depth[keep]
-        bearings = self._rectifier.camera.unproject(keypoints)
-        features = Features(
-            keypoints.astype(np.float32),
-            descriptors,
-            bearings,
-            depth,
-            np.zeros(len(keypoints), np.uint8),
-        )
-        keyframe_id = self._map.new_keyframe_id()
+        ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
+        pixels, first, first_at = self._first(view, T_world_body, tracked, rows, pixels)
+        features = self._features(view, right, pixels, self._expected_disparity(T_world_body, ids))
+        keyframe_id, n = self._map.new_keyframe_id(), len(pixels)
         self._map.add_keyframe(
             Keyframe(keyframe_id, view.stamp_ns, features),
             T_world_body,
             parent=-1 if tracked is None else tracked.keyframe_id,
             covariance=covariance,
         )
-        n, fresh_ones = len(pixels), np.full(len(keypoints) - len(pixels), -1)
-        points_camera = bearings[n:] / bearings[n:, 2:] * depth[n:, None]
-        T = self._rectifier.T_body_camera
-        new_ids = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
-        ids = np.concatenate([landmark_ids, new_ids])
-        self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
+        bearings, T = features.bearings[n:], self._rectifier.T_body_camera
+        points_camera = bearings / bearings[:, 2:] * features.depth[n:, None]
+        new = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
         self._sights.remember(keyframe_id, view)
-        first = np.concatenate([first_keyframe, fresh_ones])
-        return self.reference(
+        ids = np.concatenate([ids, new])
+        self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
+        keypoints = np.concatenate([pixels, features.keypoints[n:].astype(np.float64)])
+        return self._reference(
             keyframe_id,
             view,
-            keypoints,
             ids,
-            descriptors,
-            np.where(first < 0, keyframe_id, first),
-            np.concatenate([first_keypoint, keypoints[n:]]),
+            keypoints,
+            features.descriptors,
+            np.concatenate(
+                [np.where(first < 0, keyframe_id, first), np.full(len(new), keyframe_id)]
+            ),
+            np.concatenate([first_at, keypoints[n:]]),
+        )
+
+    def refreshed(self, reference: Reference) -> Reference:
+        """Return a keyframe as the tracker needs it, after the mapper has changed the map."""
+        r = reference
+        return self._reference(
+            r.keyframe_id,
+            r.view,
+            r.landmark_ids,
+            r.keypoints,
+            r.descriptors,
+            r.first_keyframe,
+            r.first_keypoint,
+        )
+
+    def _features(self, view: View, right: Image, pixels: Array, expected: Array) -> Features:
+        """Gather the tracked pixels, then new corners with depth, as features."""
+        wanted = self._config.features.count - len(pixels)
+        fresh, described = self._association.extend(view, pixels, wanted)
+        keypoints = np.concatenate([pixels, fresh])
+        disparity = self._disparity(view, right, keypoints, expected)
+        fb = self._rectifier.camera.fx * self._rectifier.baseline
+        depth = fb / np.where(disparity > MIN_DISPARITY_PX, disparity, np.nan)
+        # Keep all that is tracked, and of what is new only what has depth.
+        keep = np.isfinite(depth) | (np.arange(len(depth)) < len(pixels))
+        descriptors = np.concatenate([self._association.descriptors_at(view, pixels), described])
+        return Features(
+            keypoints[keep].astype(np.float32),
+            descriptors[keep],
+            self._rectifier.camera.unproject(keypoints[keep]),
+            depth[keep],
+            np.zeros(int(keep.sum()), np.uint8),
         )
 
     def _first(
-        self,
-        view: View,
-        T_world_body: Array,
-        tracked: Reference | None,
-        rows: NDArray[np.int64],
-        pixels: Array,
-    ) -> tuple[Array, NDArray[np.int64], Array]:
+        self, view: View, T_world_body: Array, tracked: Reference | None, rows: Index, pixels: Array
+    ) -> tuple[Array, Index, Array]:
         """Align tracked points to their first sights; −1 for those that start afresh here."""
         if tracked is None or self._config.tracking.association != "flow":
             return pixels, np.full(len(pixels), -1), pixels
@@ -134,17 +141,17 @@ class StereoKeyframes:
         keyframes = np.where(kept, tracked.first_keyframe[rows], -1)
         return pixels, keyframes, np.where(kept[:, None], tracked.first_keypoint[rows], pixels)
 
-    def reference(
+    def _reference(
         self,
         keyframe_id: int,
         view: View,
+        ids: Index,
         keypoints: Array,
-        ids: NDArray[np.int64],
         descriptors: NDArray[np.uint8],
-        first_keyframe: NDArray[np.int64],
+        first_keyframe: Index,
         first_keypoint: Array,
     ) -> Reference:
-        """Gather what the tracker needs of a keyframe from the map as it is now."""
+        """Add what the map knows now, and leave out landmarks that are gone."""
         points = self._map.points_world(ids)
         T = self._map.T_world_body(keyframe_id) @ self._rectifier.T_body_camera
         depth = (points - T[:3, 3]) @ T[:3, 2]
@@ -161,16 +168,14 @@ class StereoKeyframes:
             first_keypoint[good],
         )
 
-    def _expected_disparity(self, T_world_body: Array, landmark_ids: NDArray[np.int64]) -> Array:
+    def _expected_disparity(self, T_world_body: Array, landmark_ids: Index) -> Array:
         T = T_world_body @ self._rectifier.T_body_camera
         depth = (self._map.points_world(landmark_ids) - T[:3, 3]) @ T[:3, 2]
         return np.asarray(
             self._rectifier.camera.fx * self._rectifier.baseline / np.maximum(depth, 1e-3)
         )
 
-    def _disparity(
-        self, view: View, right: NDArray[np.uint8], keypoints: Array, expected: Array
-    ) -> Array:
+    def _disparity(self, view: View, right: Image, keypoints: Array, expected: Array) -> Array:
         image = self._rectifier.rectify(right, "right")
         config = self._config.stereo
         if config.method == "sgbm":
@@ -183,7 +188,7 @@ class StereoKeyframes:
         low[: len(expected)], high[: len(expected)] = expected - 4.0, expected + 4.0
         return match_sparse(view.image, image, keypoints, config, low, high)
 
-    def check_order(self, view: View, right: NDArray[np.uint8]) -> None:
+    def check_order(self, view: View, right: Image) -> None:
         """Raise if the two images match better the other way round.
 
         Raises:
@@ -201,6 +206,6 @@ class StereoKeyframes:
         swapped = int((mirrored > 1.0).sum())
         if swapped >= 30 and swapped > 2 * matched:
             raise CalibrationError(
-                f"stereo pair: {swapped} of {len(points)} points have negative disparity, {matched} "
-                "positive: left and right are swapped, exchange the two cameras"
+                f"stereo pair: {swapped} of {len(points)} points have negative disparity, "
+                f"{matched} positive: left and right are swapped, exchange the two cameras"
             )

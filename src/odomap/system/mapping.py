@@ -24,10 +24,13 @@ from numpy.typing import NDArray
 
 from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bundle
 from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.maps.snapshot import Snapshot
+from odomap.maps.snapshot import Snapshot, Update
+from odomap.system.stages import Loop
+from odomap.vision.stereo import StereoNoise
 
-__all__ = ["StereoNoise", "WindowConfig", "WindowMapper"]
+__all__ = ["WindowChange", "WindowConfig", "WindowJob", "WindowMapper"]
 
 Array = NDArray[np.float64]
 
@@ -44,18 +47,8 @@ class WindowConfig:
     """Residual, in standard deviations, beyond which an observation is dropped."""
 
 
-@dataclass(frozen=True)
-class StereoNoise:
-    """Standard deviations of what is measured in the images."""
-
-    position_px: float = 0.4
-    """Of a tracked point's position."""
-    disparity_px: float = 0.8
-    """Of a stereo match's disparity."""
-
-
 class WindowMapper:
-    """Adjusts the window that ends at each new keyframe.
+    """The mapper of an odometry: adjusts the window that ends at each new keyframe.
 
     Args:
         map: where keyframes and landmarks are.
@@ -78,40 +71,28 @@ class WindowMapper:
         self._T_camera_body = se3_inverse(T_body_camera)
         self._focal, self._baseline = focal, baseline
         self._recent: list[int] = []
-        self.last: BundleSolution | None = None
 
-    def restart(self) -> None:
-        """Begin a new window: the keyframes so far share no landmarks with those to come."""
-        self._map.retire_keyframes(self._recent)
-        self._recent = []
-
-    def add(self, keyframe_id: int) -> None:
-        """Take in a keyframe that is in the map already, and adjust the window it ends."""
-        self._recent.append(keyframe_id)
+    def add(self, keyframe: Keyframe) -> "WindowJob | None":
+        """Take in a keyframe that is in the map, and read the window that it ends."""
+        size, fixed = self._window.size, self._window.fixed
+        leaving = self._recent[: -(size + fixed - 1)]
+        if not len(self._map.covisible(keyframe.id)[0]):
+            leaving = self._recent  # odometry has started anew: nothing ties the window to it
+        self._recent = [*self._recent[len(leaving) :], keyframe.id]
         if len(self._recent) < 2:
-            return
-        free, fixed = self._recent[-self._window.size :], self._recent[: -self._window.size]
-        if not fixed:
-            free, fixed = free[1:], free[:1]
-        snapshot = self._map.snapshot(free, fixed)
-        if not len(snapshot.obs_keyframe):
-            return
-        bundle = self._make_bundle(snapshot)
-        solution = solve_bundle(bundle, self._bundle)
-        wrong = solution.chi2 > self._window.gate**2
-        covariances = self._world_covariances(snapshot, solution)
-        self._map.apply(
-            snapshot.solved(
-                solution.Ts_world_body,
-                solution.points_world,
-                dropped=np.flatnonzero(wrong),
-                covariances=covariances,
-            )
+            self._map.retire_keyframes(leaving)
+            return None
+        held = max(1, len(self._recent) - size)
+        snapshot = self._map.snapshot(self._recent[held:], self._recent[:held])
+        anchor = int(snapshot.keyframe_ids[np.flatnonzero(snapshot.is_fixed)[-1]])
+        return WindowJob(
+            snapshot,
+            self._make_bundle(snapshot),
+            self._bundle,
+            self._window.gate,
+            self._map.covariance(anchor),
+            tuple(leaving),
         )
-        self.last = solution
-        leaving = self._recent[: -(self._window.size + self._window.fixed - 1)]
-        self._map.retire_keyframes(leaving)
-        self._recent = self._recent[len(leaving) :]
 
     def _make_bundle(self, snapshot: Snapshot) -> Bundle:
         """Gather what the keyframes measured, in the order of the snapshot's observations."""
@@ -141,15 +122,73 @@ class WindowMapper:
             np.tile(self._focal / sigma, (len(xy), 1)),
         )
 
-    def _world_covariances(self, snapshot: Snapshot, solution: BundleSolution) -> Array:
-        """Chain the covariances of the newest keyframe; older ones keep what they had."""
-        covariances = np.stack([self._map.covariance(int(k)) for k in snapshot.keyframe_ids])
-        fixed, free = np.flatnonzero(snapshot.is_fixed), np.flatnonzero(~snapshot.is_fixed)
-        anchor, newest = fixed[-1], free[-1]
+
+@dataclass(frozen=True, eq=False)
+class WindowJob:
+    """A window read from the map, ready to be solved.
+
+    Attributes:
+        snapshot: the window.
+        bundle: its observations.
+        config: of the solver.
+        gate: residual beyond which an observation is dropped, standard deviations.
+        anchor_covariance: (6, 6) of the newest keyframe that is held fixed.
+        leaving: keyframes that have left the window.
+    """
+
+    snapshot: Snapshot
+    bundle: Bundle
+    config: BundleConfig
+    gate: float
+    anchor_covariance: Array
+    leaving: tuple[int, ...]
+
+    def solve(self) -> "WindowChange":
+        """Adjust the window."""
+        solution = solve_bundle(self.bundle, self.config)
+        wrong = np.flatnonzero(solution.chi2 > self.gate**2)
+        update = self.snapshot.solved(solution.Ts_world_body, solution.points_world, dropped=wrong)
+        newest = int(np.flatnonzero(~self.snapshot.is_fixed)[-1])
+        return WindowChange(
+            update,
+            int(self.snapshot.keyframe_ids[newest]),
+            self._world_covariance(solution, newest),
+            self.leaving,
+            solution,
+        )
+
+    def _world_covariance(self, solution: BundleSolution, newest: int) -> Array:
+        """Chain the covariance of the newest keyframe to that of the anchor."""
+        anchor = int(np.flatnonzero(self.snapshot.is_fixed)[-1])
         Ts = solution.Ts_world_body
         Ad = se3_adjoint(se3_inverse(Ts[newest]) @ Ts[anchor])
         factor = max(1.0, solution.variance_factor)
-        covariances[newest] = (
-            Ad @ covariances[anchor] @ Ad.T + factor * solution.covariances[newest]
-        )
-        return covariances
+        relative = factor * solution.covariances[newest]
+        return np.asarray(Ad @ self.anchor_covariance @ Ad.T + relative)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowChange:
+    """A solved window, to be written into the map.
+
+    Attributes:
+        update: poses and landmarks.
+        newest_id: the keyframe that ended the window.
+        covariance: (6, 6) of its pose in the world.
+        leaving: keyframes that have left the window.
+        solution: what the solver said.
+    """
+
+    update: Update
+    newest_id: int
+    covariance: Array
+    leaving: tuple[int, ...]
+    solution: BundleSolution
+    loops: tuple[Loop, ...] = ()
+
+    def write(self, map: Map) -> None:
+        """Move the window, and retire what has left it."""
+        with map.lock:
+            map.apply(self.update)
+            map.set_covariance([self.newest_id], self.covariance)
+            map.retire_keyframes(self.leaving)

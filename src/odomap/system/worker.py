@@ -18,10 +18,11 @@ and ends the run; a second one interrupts at once.
 import logging
 import signal
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType, MappingProxyType
 from typing import TypeVar
 
@@ -84,8 +85,11 @@ class Worker(ABC):
         self._told_version = stages.map.version
 
     @abstractmethod
-    def _advance(self, frame: Frame) -> Estimate:
-        """Take one frame through the stages, as far as the rhythm goes, and return its estimate."""
+    def advance(self, frame: Frame) -> Estimate:
+        """Take one frame through the stages, as far as the rhythm goes, and return its estimate.
+
+        Like `track`, but leaves Ctrl-C to the caller (see `deferred_interrupt`).
+        """
 
     @abstractmethod
     def finish(self) -> None:
@@ -104,7 +108,7 @@ class Worker(ABC):
             KeyboardInterrupt: Ctrl-C was pressed meanwhile; the frame is done all the same.
         """
         with deferred_interrupt() as interrupt:
-            estimate = self._advance(frame)
+            estimate = self.advance(frame)
         if interrupt.is_set():
             raise KeyboardInterrupt
         return estimate
@@ -122,7 +126,7 @@ class Worker(ABC):
         with deferred_interrupt() as interrupt:
             for frame in frames:
                 if not interrupt.is_set():
-                    yield frame, self._advance(frame)
+                    yield frame, self.advance(frame)
                 self.interrupted = interrupt.is_set()
                 if self.interrupted:
                     break
@@ -153,14 +157,16 @@ class Worker(ABC):
 class InlineWorker(Worker):
     """Each stage in turn, in the caller's thread; observers too."""
 
-    def _advance(self, frame: Frame) -> Estimate:
+    def advance(self, frame: Frame) -> Estimate:
         """Track a frame; if it became a keyframe, map and close before returning."""
         estimate = self.stages.tracker.track(frame)
         self._tell("on_estimate", self.on_estimate, estimate)
         if estimate.is_keyframe:
             keyframe = self.stages.map.keyframe(estimate.keyframe_id)
             self._tell("on_keyframe", self.on_keyframe, keyframe)
-            for stage in (self.stages.mapper, self.stages.closer):
+            timing = dict(estimate.timing)
+            for name, stage in (("map", self.stages.mapper), ("close", self.stages.closer)):
+                start = time.perf_counter()
                 job = stage.add(keyframe) if stage is not None else None
                 if job is None:
                     continue
@@ -168,6 +174,8 @@ class InlineWorker(Worker):
                 change.write(self.stages.map)
                 for loop in change.loops:
                     self._tell("on_loop", self.on_loop, loop)
+                timing[name] = 1e3 * (time.perf_counter() - start)
+            estimate = replace(estimate, timing=timing)
         self._tell_map()
         return estimate
 

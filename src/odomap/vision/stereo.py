@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from odomap.kernels import kernel
 from odomap.vision.flow import align_patches
 
-__all__ = ["StereoConfig", "match_sparse", "sgbm_disparity"]
+__all__ = ["StereoConfig", "StereoNoise", "match_sparse", "sgbm_disparity"]
 
 Image = NDArray[np.uint8]
 
@@ -48,6 +48,16 @@ class StereoConfig:
     """Smallest normalised correlation of the two patches."""
     max_vertical_px: float = 1.0
     """Largest distance of a match from its row."""
+
+
+@dataclass(frozen=True)
+class StereoNoise:
+    """Standard deviations of what is measured in the images."""
+
+    position_px: float = 0.4
+    """Of a tracked point's position."""
+    disparity_px: float = 0.8
+    """Of a stereo match's disparity."""
 
 
 def match_sparse(
