@@ -66,7 +66,8 @@ def test_a_file_is_short(module):
 
 
 def is_kernel(function):
-    return any(isinstance(d, ast.Name) and d.id == "kernel" for d in function.decorator_list)
+    decorators = (d.func if isinstance(d, ast.Call) else d for d in function.decorator_list)
+    return any(isinstance(d, ast.Name) and d.id == "kernel" for d in decorators)
 
 
 def length_of_docstring(node):

@@ -61,9 +61,10 @@ def relocalize(
     pixels = corners.keypoints[of_corner[matches[good]]].astype(np.float64)
     result = solve_pnp(
         points_world[known[kept[good]]],
-        camera.undistort(pixels),
+        pixels,
         camera,
         seed=view.frame_id,
         threshold_px=3.0,
+        min_inliers=min_inliers,
     )
-    return result.T_world_camera.matrix if result.num_inliers >= min_inliers else None
+    return result.T_world_camera.matrix if result.converged else None
