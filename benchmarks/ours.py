@@ -1,0 +1,60 @@
+"""Play a recording through odomap at the pace of its sensor, as the peer's script does.
+
+    python ours.py DATA PREFIX [--frames N] [--cv-threads N] [--fast] [--set NAME=VALUE]
+
+Writes PREFIX.tum and PREFIX.json (see `meter`). A frame is read and decoded before it is due; its
+tracking starts when it is due, or at once where the system is late. `sequences.py` runs this.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import cv2
+from meter import Meter
+
+from odomap.files.trajectories import write_tum
+from odomap.kernels import modules_with_kernels, warm_up
+from odomap.maps.estimate import Status
+from odomap.run import chosen_config
+from odomap.sources.open import open as open_source
+from odomap.system.odometry import StereoVO
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data")
+    parser.add_argument("prefix")
+    parser.add_argument("--frames", type=int, default=0)
+    parser.add_argument("--cv-threads", type=int, default=0)
+    parser.add_argument("--fast", action="store_true", help="do not wait for the sensor")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    options = parser.parse_args()
+    if options.cv_threads:
+        cv2.setNumThreads(options.cv_threads)
+    source = open_source(options.data)
+    assignments = [tuple(text.split("=", 1)) for text in options.set]
+    system = StereoVO(source.rig, chosen_config(None, None, assignments))
+    imported = set(sys.modules)
+    for name in modules_with_kernels():
+        if name in imported or name.startswith("odomap.geometry."):
+            warm_up(name)
+    meter = Meter()
+    tracked, start, first = 0, 0.0, 0
+    for count, frame in enumerate(source):
+        if count == (options.frames or len(source)):
+            break
+        if count == 0:
+            start, first = time.perf_counter(), frame.stamp_ns
+        due = start + 1e-9 * (frame.stamp_ns - first)
+        if not options.fast:
+            time.sleep(max(0.0, due - time.perf_counter()))
+        estimate = meter.call(system.track, frame)
+        tracked += estimate.status != Status.LOST and estimate.keyframe_id >= 0
+    write_tum(Path(f"{options.prefix}.tum"), system.finish().trajectory)
+    meter.write(f"{options.prefix}.json", tracked, cv2.getNumThreads())
+
+
+if __name__ == "__main__":
+    main()
