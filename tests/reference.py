@@ -65,3 +65,56 @@ def pixel_errors(R: Array, t: Array, points: Array, plane: Array, slopes: Array)
     """L (π(p_camera) - x) for T_world_camera = (R, t); (N, 2)."""
     p = (points - t) @ R
     return np.einsum("nij,nj->ni", slopes, p[:, :2] / p[:, 2:] - plane)
+
+
+def corner_strength(image: Array, x: int, y: int) -> float:
+    """Smaller eigenvalue of the mean of ∇I ∇Iᵀ over the 7x7 pixels around (x, y)."""
+    dy, dx = np.gradient(image.astype(float)[y - 4 : y + 5, x - 4 : x + 5])
+    g = np.stack([dx[1:-1, 1:-1].ravel(), dy[1:-1, 1:-1].ravel()])
+    return float(np.linalg.eigvalsh(g @ g.T / 49)[0])
+
+
+def spread(points: Array, strength: Array, count: int, radius: float, occupied: Array) -> list[int]:
+    """The strongest point that keeps its distance, again and again; then at half the distance."""
+    kept: list[int] = []
+    for r in (radius, radius / 2):
+        for k in np.argsort(-strength, kind="stable").tolist():
+            others = np.concatenate([occupied, points[kept]])
+            if len(kept) < count and (np.sum((others - points[k]) ** 2, axis=1) >= r * r).all():
+                kept.append(k)
+    return kept
+
+
+def distances(wanted: Array, others: Array) -> Array:
+    """Bits that differ of 32 bytes; squared distances of longer descriptors; (M, N)."""
+    if wanted.shape[1] == 32:
+        return np.unpackbits(wanted[:, None] ^ others[None], axis=2).sum(axis=2)
+    return np.sum((wanted[:, None].astype(float) - others[None].astype(float)) ** 2, axis=2)
+
+
+def match_guided(
+    near: Array, distance: Array, ratio: float, limit: float
+) -> list[tuple[int, float]]:
+    """For each row (its match or -1, distance): the best of those near, if clearly the best."""
+    rows = []
+    for is_near, row in zip(near, distance):
+        order = sorted((d, n) for n, d in enumerate(row.tolist()) if is_near[n])
+        second = order[1][0] if len(order) > 1 else np.inf
+        good = bool(order) and order[0][0] <= limit and order[0][0] < ratio * second
+        rows.append((order[0][1], order[0][0]) if good else (-1, np.inf))
+    return rows
+
+
+def residual(
+    T_world_body: Array,
+    T_camera_body: Array,
+    baseline: float,
+    p: Array,
+    xy: Array,
+    disparity: float,
+    weights: Array,
+) -> Array:
+    """Weighted reprojection errors of x, y and disparity (0 if there is none)."""
+    X, Y, Z = (T_camera_body @ np.linalg.inv(T_world_body) @ np.append(p, 1.0))[:3]
+    last = 0.0 if np.isnan(disparity) else baseline / Z - disparity
+    return np.array([X / Z - xy[0], Y / Z - xy[1], last]) * (weights[0], weights[0], weights[1])

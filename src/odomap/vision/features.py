@@ -131,7 +131,8 @@ def _candidates(image: Image, config: FeatureConfig, wanted: int) -> Corners:
         order = np.arange(len(points), 0, -1, dtype=np.float64)  # they come sorted by response
         return Corners(points, order, np.zeros(len(points), np.uint8))
     detector = (
-        cv2.ORB.create(nfeatures=3 * wanted, fastThreshold=config.threshold)
+        # ORB finds a corner again on every level; of those in one place only one will be kept.
+        cv2.ORB.create(nfeatures=8 * wanted, fastThreshold=config.threshold)
         if config.detector == "orb"
         else cv2.SIFT.create(nfeatures=3 * wanted)
     )
@@ -140,7 +141,9 @@ def _candidates(image: Image, config: FeatureConfig, wanted: int) -> Corners:
         return _empty()
     points = np.array([k.pt for k in keypoints], np.float32)
     strength = np.array([k.response for k in keypoints], np.float64)
-    return Corners(points, strength, np.array([k.octave & 7 for k in keypoints], np.uint8))
+    # SIFT packs the level in the lowest byte, −1 for the doubled image.
+    levels = np.array([k.octave & 0xFF for k in keypoints], np.uint8).view(np.int8)
+    return Corners(points, strength, levels.clip(0).astype(np.uint8))
 
 
 def _fast(image: Image, threshold: int, wanted: int) -> Corners:

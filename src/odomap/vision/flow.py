@@ -200,7 +200,7 @@ def _sample_template(
 ) -> bool:
     """patch[v, u] = image((x, y) + B (u, v)), bilinear, with a margin for gradients."""
     height, width = image.shape
-    reach = half + 1.0
+    reach = half + 1.001  # single precision must not round over the border
     rx = (abs(B[0, 0]) + abs(B[0, 1])) * reach
     ry = (abs(B[1, 0]) + abs(B[1, 1])) * reach
     if not (x - rx >= 0.0 and y - ry >= 0.0 and x + rx < width - 1.0 and y + ry < height - 1.0):
