@@ -39,8 +39,8 @@ class TrackingConfig:
     """flow: patches followed by optical flow; descriptors: features matched in every frame."""
     min_inliers: int = 15
     """Observations that must agree with a pose for it to count as tracked."""
-    keyframe_ratio: float = 0.7
-    """A keyframe is made when fewer than this fraction of the last one's landmarks are tracked."""
+    keyframe_ratio: float = 0.85
+    """A keyframe is made when inliers fall below this fraction of those just after the last one."""
     keyframe_motion: float = 0.04
     """A keyframe is made when points have moved by this fraction of the image width (median)."""
     keyframe_interval: int = 20
@@ -180,7 +180,7 @@ class DescriptorAssociation:
 
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
         """Detect and describe; more than a keyframe needs, since not every feature repeats."""
-        corners = detect(image, self.features, 3 * self.features.count, None, self.mask)
+        corners = detect(image, self.features, 2 * self.features.count, None, self.mask)
         descriptors, kept = describe(image, corners, self.features.detector)
         corners = Corners(corners.keypoints[kept], corners.strength[kept], corners.level[kept])
         return View(frame_id, stamp_ns, (image,), corners, descriptors)

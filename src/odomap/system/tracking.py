@@ -257,7 +257,7 @@ class StereoTracker:
         motion = np.median(np.linalg.norm(moved[located.inliers], axis=1))
         return bool(
             self._since_keyframe >= config.keyframe_interval
-            or located.num_inliers < config.keyframe_ratio * len(reference.landmark_ids)
+            or located.num_inliers < config.keyframe_ratio * self._first_count
             or motion > config.keyframe_motion * self._rectifier.camera.width
         )
 

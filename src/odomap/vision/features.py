@@ -29,6 +29,7 @@ __all__ = [
     "corner_strength",
     "describe",
     "detect",
+    "orientation",
     "spread",
 ]
 
@@ -134,7 +135,7 @@ def _candidates(image: Image, config: FeatureConfig, wanted: int) -> Corners:
         # ORB finds a corner again on every level; of those in one place only one will be kept.
         cv2.ORB.create(nfeatures=8 * wanted, fastThreshold=config.threshold)
         if config.detector == "orb"
-        else cv2.SIFT.create(nfeatures=3 * wanted)
+        else cv2.SIFT.create(nfeatures=2 * wanted)
     )
     keypoints = detector.detect(image, None)
     if not keypoints:
@@ -314,23 +315,17 @@ def describe(
         (M, D) uint8 descriptors and the (M,) indices of the corners they belong to (OpenCV leaves
         out corners too near to the border).
     """
-    size = [31.0 * 1.2 ** int(level) for level in corners.level]
-    keypoints = [
-        cv2.KeyPoint(
-            float(x),
-            float(y),
-            s,
-            -1.0 if detector == "sift" else _angle(image, x, y),
-            0.0,
-            int(level),
-            i,
-        )
-        for i, ((x, y), s, level) in enumerate(zip(corners.keypoints, size, corners.level))
-    ]
     if detector == "sift":
-        keypoints = [
-            cv2.KeyPoint(k.pt[0], k.pt[1], 7.0, 0.0, 0.0, 0, k.class_id) for k in keypoints
-        ]
+        size, angles = np.full(len(corners.level), 7.0), np.zeros(len(corners.level))
+    else:
+        size, angles = 31.0 * 1.2**corners.level, orientation(image, corners.keypoints)
+    octaves = np.zeros(len(size), np.int64) if detector == "sift" else corners.level
+    keypoints = [
+        cv2.KeyPoint(x, y, s, angle, 0.0, octave, i)
+        for i, ((x, y), s, angle, octave) in enumerate(
+            zip(corners.keypoints.tolist(), size.tolist(), angles.tolist(), octaves.tolist())
+        )
+    ]
     extractor = cv2.SIFT.create() if detector == "sift" else cv2.ORB.create()
     kept, descriptors = extractor.compute(image, keypoints)
     if descriptors is None or len(kept) == 0:
@@ -340,16 +335,39 @@ def describe(
     )
 
 
-def _angle(image: Image, x: float, y: float) -> float:
-    """Orientation by the intensity centroid of the 31x31 patch, degrees (ORB, 2011)."""
-    u, v = round(float(x)), round(float(y))
-    patch = image[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16].astype(np.float64)
-    if patch.shape != (31, 31):
-        return 0.0
-    grid = np.arange(-15.0, 16.0)
-    return float(
-        np.degrees(np.arctan2((patch * grid[:, None]).sum(), (patch * grid).sum())) % 360.0
-    )
+def orientation(image: Image, points: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the direction of the intensity centroid of the 31x31 patch at each point.
+
+    Args:
+        image: (H, W) uint8.
+        points: (N, 2) float32 pixels; within 15 px of the border the angle is 0.
+
+    Returns:
+        (N,) degrees from the x axis towards y, 0 to 360 (Rublee et al., ORB, ICCV 2011).
+    """
+    moments = np.zeros((len(points), 2))
+    _centroid_kernel(image, np.ascontiguousarray(points, np.float32), moments)
+    angles: NDArray[np.float64] = np.degrees(np.arctan2(moments[:, 1], moments[:, 0])) % 360.0
+    return angles
+
+
+@kernel
+def _centroid_kernel(
+    image: Image, points: NDArray[np.float32], moments: NDArray[np.float64]
+) -> None:
+    """m = Σ (u, v) I(x + u, y + v) over the disc of radius 15."""
+    height, width = image.shape
+    for i in range(len(points)):
+        x, y = int(points[i, 0] + 0.5), int(points[i, 1] + 0.5)
+        if x < 15 or y < 15 or x >= width - 15 or y >= height - 15:
+            continue
+        mx, my = 0, 0
+        for v in range(-15, 16):
+            for u in range(-15, 16):
+                if u * u + v * v <= 225:
+                    mx += u * image[y + v, x + u]
+                    my += v * image[y + v, x + u]
+        moments[i, 0], moments[i, 1] = mx, my
 
 
 def warm_up() -> None:
@@ -357,3 +375,4 @@ def warm_up() -> None:
     image = np.zeros((32, 32), np.uint8)
     points = np.array([[10.0, 10.0], [20.0, 20.0]], np.float32)
     spread(points, corner_strength(image, points), 2, 5.0, image.shape, points[:0])
+    orientation(image, points)

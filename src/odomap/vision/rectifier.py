@@ -68,12 +68,15 @@ class Rectifier:
     def to_raw(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where rectified pixels (N, 2) of the left camera lie in its raw image, to 0.1 px.
 
-        The map is looked up at the nearest pixel; for drawing, where the exact way back through the
-        lens (`geometry.to_raw`) would cost more than tracking the points.
+        The map is read between its pixels; for drawing, where the exact way back through the lens
+        (`geometry.to_raw`) would cost more than tracking the points.
         """
         if self.geometry.is_identity or not len(pixels):
             return pixels
-        x, y = np.round(pixels).astype(np.int64).T
-        x, y = x.clip(0, self.camera.width - 1), y.clip(0, self.camera.height - 1)
-        raw = np.stack([self._map_left[0][y, x], self._map_left[1][y, x]], axis=1)
-        return np.asarray(raw + (pixels - np.stack([x, y], axis=1)))
+        at = pixels.astype(np.float32)
+        x, y = at[None, :, 0], at[None, :, 1]
+        raw = [
+            cv2.remap(way, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+            for way in self._map_left
+        ]
+        return np.stack(raw, axis=1).astype(np.float64)
