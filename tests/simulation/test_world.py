@@ -1,5 +1,6 @@
 """Worlds: decided by their spec, in any order, with the rig they say."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -113,6 +114,20 @@ def test_moving_objects_move_and_leave_the_rest_alone(noisy_room: World) -> None
     rows, velocities = noisy_room.scene.moving(1.0)
     np.testing.assert_array_equal(rows, np.flatnonzero(moving))
     assert 0.05 < np.linalg.norm(velocities, axis=1).min() < 2.0
+
+
+def test_calibration_is_wrong_by_no_more_than_it_says() -> None:
+    spec = {"kind": "room", "seed": 5, "frames": 6, "resolution": (160, 100), "moving_objects": 2}
+    off, right = (World.make(**spec, calibration_px=px, noise=0.0) for px in (0.5, 0.0))
+    assert off.rig == right.rig
+    shifts = []
+    for a, b in zip(off.frame(0).images, right.frame(0).images, strict=True):
+        assert a is not None
+        assert b is not None
+        inner = b[20:80, 30:130].astype(float)
+        shift, _ = cv2.phaseCorrelate(inner, a[20:80, 30:130].astype(float))
+        shifts.append(np.hypot(*shift))
+    assert 0.05 < max(shifts) < 1.5
 
 
 def test_the_street_is_a_loop_of_half_a_kilometre(street: World) -> None:

@@ -57,6 +57,10 @@ class WorldSpec:
     """Mean speed in m/s; 0 for 0.6 in a room and 7.5 in a street."""
     noise: float = 1.0
     """Factor on all imperfections of all sensors; 0 for ideal ones."""
+    calibration_px: float = 0.0
+    """How wrong the rig's calibration is at most: principal point, focal length (at the image's
+    rim) and rotation of each camera, in pixels. Real rigs are off by 0.1 or so; no sensor noise
+    averages that out."""
     moving_objects: int = 0
     """How many things move through the scene."""
     sensors: tuple[str, ...] = ("stereo", "imu")
@@ -82,7 +86,7 @@ class WorldSpec:
         for name, low in (("frames", 1), ("seed", 0), ("moving_objects", 0)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name}: {getattr(self, name)} must be {low} or more")
-        for name in ("rate_hz", "speed", "noise"):
+        for name in ("rate_hz", "speed", "noise", "calibration_px"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"{name}: {value} must be finite and not negative")
@@ -123,6 +127,9 @@ class World:
         T_imu_body = _mount_pose(carried, first)
         self._carried = carried
         self._T_imu_body = T_imu_body.matrix
+        self._true_cameras = [
+            _miscalibrated(mount, self.spec, number) for number, mount in enumerate(carried.cameras)
+        ]
         self.rig = _relative_to(carried, T_imu_body.inverse(), first)
         seconds = np.arange(self.spec.frames) / self.spec.rate_hz
         self._stamps = START_NS + np.rint(seconds * 1e9).astype(np.int64)
@@ -186,7 +193,7 @@ class World:
         times = time + noise.shutter_s * np.array([0.0, 0.5])
         Ts_world_imu = self._path.at(times).Ts_world_body
         images, depth = [], None
-        for number, mount in enumerate(self._carried.cameras):
+        for number, mount in enumerate(self._true_cameras):
             Ts = Ts_world_imu @ mount.T_body_camera.matrix
             picture = render(self.scene, mount.camera, Ts, times)
             key = (seed, index, number)
@@ -243,7 +250,7 @@ def _carried(spec: WorldSpec) -> Rig:
         (width, height),
     )
     R_imu_carrier = R_CARRIER_IMU.T if is_room else np.eye(3)
-    tilt = [0.0, 0.0, 0.0, 0.021, -0.013, 0.009] if is_room else [0, 0, 0, -0.008, 0.011, 0.004]
+    tilt = [0.0, 0.0, 0.0, -0.11, -0.013, 0.009] if is_room else [0, 0, 0, -0.008, 0.011, 0.004]
     lever = [-0.024, -0.061, 0.012] if is_room else [0.81, 0.29, 0.48]
     T_imu_left = SE3.from_parts(R_imu_carrier @ R_CARRIER_CAMERA, np.array(lever)) @ SE3.exp(
         np.array(tilt, float)
@@ -260,6 +267,20 @@ def _carried(spec: WorldSpec) -> Rig:
         imu=_imu_mount(spec) if "imu" in spec.sensors else None,
         lidars=_lidar_mounts(spec, R_imu_carrier),
     )
+
+
+def _miscalibrated(mount: CameraMount, spec: WorldSpec, number: int) -> CameraMount:
+    """Return what the camera really is where the rig describes it wrongly."""
+    if spec.calibration_px == 0:
+        return mount
+    camera = mount.camera
+    off = spec.calibration_px * np.random.default_rng([spec.seed, number, 19]).uniform(-1, 1, 6)
+    focal = camera.fx + off[0] * 2 * camera.fx / camera.width
+    true = replace(
+        camera, intrinsics=np.array([focal, focal, camera.cx + off[1], camera.cy + off[2]])
+    )
+    turn = SE3.exp(np.concatenate([np.zeros(3), off[3:] / camera.fx]))
+    return replace(mount, camera=true, T_body_camera=mount.T_body_camera @ turn)
 
 
 def _imu_mount(spec: WorldSpec) -> ImuMount:
