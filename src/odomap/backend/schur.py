@@ -235,7 +235,15 @@ def robust_cost(
 
 
 def warm_up() -> None:
-    """Compile the kernels of this module, by way of a bundle of two poses."""
-    from odomap.backend import bundle
-
-    bundle.warm_up()
+    """Compile the kernels of this module."""
+    none = np.zeros(1, np.int64)
+    poses = PoseArrays(np.eye(3)[None], np.zeros((1, 3)), none)
+    cameras = CameraArrays(np.eye(3)[None], np.zeros((1, 3)), np.ones(1))
+    seen = SightArrays(np.array([0, 1]), none, none, np.zeros((1, 2)), np.ones(1), np.ones((1, 2)))
+    system = SystemArrays(
+        np.empty((6, 6)), np.empty(6), np.empty((1, 6, 3)), np.empty((1, 3, 3)), np.empty((1, 3))
+    )
+    points = np.array([[0.0, 0.0, 2.0]])
+    robust_cost(poses, points, cameras, seen, 2.5, np.empty(1))
+    reduced_system(poses, points, cameras, seen, 2.5, 1.0, system)
+    back_substitute(poses, seen, system, points, np.empty((1, 3)))
