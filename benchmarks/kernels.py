@@ -202,8 +202,24 @@ def solvers(repeats: int) -> list[Row]:
 
 def help_time() -> Lap:
     """Return the time `odomap --help` takes, the smallest of five."""
-    laps = [_child([sys.executable, "-m", "odomap", "--help"], {}) for _ in range(5)]
+    laps = [_child([sys.executable, "-m", "odomap", "--help"], {})[0] for _ in range(5)]
     return Lap(min(lap.cpu for lap in laps), min(lap.wall for lap in laps))
+
+
+COLD_RUN = """
+import json, sys, time
+import odomap.run
+laps, last = [], [None, 0.0, 0.0]
+def progress(p):
+    name = f"{p.stage} {p.text}".strip()
+    if name != last[0]:
+        now = time.process_time(), time.perf_counter()
+        if last[0] is not None:
+            laps.append([last[0], now[0] - last[1], now[1] - last[2]])
+        last[:] = name, *now
+odomap.run.run(sys.argv[1], sys.argv[2], progress=progress)
+print(json.dumps(laps))
+"""
 
 
 def cold_start() -> dict[str, Lap]:
@@ -213,19 +229,22 @@ def cold_start() -> dict[str, Lap]:
         folder = Path(name)
         world = World.make(kind="room", seed=1, frames=3, resolution=(320, 200))
         recording = export_euroc(world, folder / "room")
+        cache = {"NUMBA_CACHE_DIR": str(folder / "cache")}
         for which in ("cold", "warm"):
-            out = folder / which
-            command = [sys.executable, "-m", "odomap", "run", str(recording), "--out", str(out)]
-            lap = _child(command, {"NUMBA_CACHE_DIR": str(folder / "cache")})
-            compile_s = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["compile_s"]
-            # Compiling is one thread's work: it has the share of the processor the whole run has.
-            share = min(1.0, lap.cpu / lap.wall)
-            laps[f"{which}, compiling"] = Lap(share * compile_s, compile_s)
+            command = [sys.executable, "-c", COLD_RUN, str(recording), str(folder / which)]
+            lap, said = _child(command, cache)
+            stages = [(stage, Lap(*times)) for stage, *times in json.loads(said.splitlines()[-1])]
+            parts = [(stage, part) for stage, part in stages if stage.startswith("compiling")]
+            cpu, wall = (sum(getattr(part, of) for _, part in parts) for of in ("cpu", "wall"))
+            laps[f"{which}, compiling"] = Lap(cpu, wall)
             laps[f"{which}, whole run with report"] = lap
+            if which == "cold":
+                parts.sort(key=lambda item: -item[1].cpu)
+                laps |= {f"cold, {stage.split('.', 1)[1]}": part for stage, part in parts[:8]}
     return laps
 
 
-def _child(command: list[str], variables: Mapping[str, str]) -> Lap:
+def _child(command: list[str], variables: Mapping[str, str]) -> tuple[Lap, str]:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     done = subprocess.run(
@@ -233,10 +252,12 @@ def _child(command: list[str], variables: Mapping[str, str]) -> Lap:
     )
     wall = time.perf_counter() - start
     if done.returncode != 0:
-        sys.exit(f"{' '.join(command[2:])} failed:\n{(done.stderr or done.stdout)[-1500:]}")
+        sys.exit(
+            f"{Path(command[0]).name} {command[1]} failed:\n{(done.stderr or done.stdout)[-1500:]}"
+        )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Lap(cpu, wall)
+    return Lap(cpu, wall), done.stdout
 
 
 def _cells(row: Row) -> str:

@@ -74,9 +74,8 @@ def main() -> int:
 
     result = run(source, progress=sample)
     seconds = time.perf_counter() - start
+    slope = growth(samples, options.warm_up)
     frames, mb = np.array(samples).T
-    counted = frames > min(options.warm_up, 0.5 * frames[-1])  # until then caches and pools fill
-    slope = 1000.0 * np.polyfit(frames[counted], mb[counted], 1)[0]
     for k in np.unique(np.linspace(0, len(frames) - 1, 13).round().astype(int)):
         print(f"  frame {frames[k]:6.0f}  {mb[k]:8.1f} MB")
     numbers = result.metrics
@@ -85,7 +84,7 @@ def main() -> int:
         f"{numbers['keyframes']} keyframes, {numbers['landmarks']} landmarks in the map"
     )
     verdict = "flat" if slope <= options.limit else "NOT FLAT"
-    print(f"{slope:+.2f} MB per 1000 frames from frame {frames[counted][0]:.0f} on: {verdict}")
+    print(f"{slope:+.2f} MB per 1000 frames after warm-up: {verdict}")
     if options.json:
         content = {"slope_mb_per_1000": slope, "samples": samples, "lost": numbers["lost"]}
         Path(options.json).write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -120,6 +119,13 @@ def open_it(options: argparse.Namespace) -> Source:
         kind=options.kind, seed=options.seed, frames=frames, resolution=(width, height)
     )
     return ToAndFro(world, options.frames)
+
+
+def growth(samples: list[tuple[int, float]], warm_up: int) -> float:
+    """Return the slope of memory after warm-up (at most half the run), MB per 1,000 frames."""
+    frames, mb = np.array(samples).T
+    counted = frames > min(warm_up, 0.5 * frames[-1])
+    return float(1000.0 * np.polyfit(frames[counted], mb[counted], 1)[0])
 
 
 def resident_mb() -> float:

@@ -1,0 +1,151 @@
+"""Ours beside the peer's: which ratios pass, and what is said when something is missing."""
+
+import argparse
+import json
+import sys
+
+import numpy as np
+import pytest
+
+NUMBERS = {"ate_m": 0.004, "ms_median": 10.0, "ms_p95": 30.0, "cpu_s": 2.0, "peak_memory_mb": 200.0}
+COUNTS = {"frames": 110, "tracked": 110, "threads": 3, "cv_threads": 2}
+
+
+def baseline_of(gate, **changes):
+    return {"tolerance": gate.TOLERANCE, "ratios": {"a": {"ms_median": 0.4, **changes}}}
+
+
+@pytest.mark.parametrize(
+    ("ratio", "is_open"), [(0.4, True), (0.1, True), (0.479, True), (0.481, False), (2.0, False)]
+)
+def test_gate_opens_up_to_the_tolerance_above_the_baseline(load, ratio, is_open):
+    gate = load("gate")
+    worse = gate.regressions({"a": {"ms_median": ratio}}, baseline_of(gate))
+    assert (not worse) == is_open
+    assert is_open or ("a: ms_median" in worse[0] and f"{ratio:.3f}" in worse[0])
+
+
+@pytest.mark.parametrize(
+    "now",
+    [{"a": {"ms_median": float("nan")}}, {"b": {"ms_median": 0.1}}, {"a": {"cpu_s": 0.1}}],
+    ids=["not a number", "unknown recording", "unknown quantity"],
+)
+def test_gate_stays_closed_on_what_cannot_be_compared(load, now):
+    gate = load("gate")
+    assert len(gate.regressions(now, baseline_of(gate))) == 1
+
+
+def test_gate_stays_closed_without_a_baseline(load, tmp_path):
+    gate = load("gate")
+    assert gate.regressions({"a": {"cpu_s": 0.1}}, gate.read(tmp_path / "absent.json"))
+
+
+def test_ratio_is_ours_over_the_peers(load):
+    gate = load("gate")
+    twice = {name: 2.0 * value for name, value in NUMBERS.items()}
+    assert gate.ratios(NUMBERS | COUNTS, twice | COUNTS) == dict.fromkeys(NUMBERS, 0.5)
+    assert gate.ratios({"cpu_s": 1.0}, {"cpu_s": 0.0}) == {"cpu_s": float("inf")}
+
+
+def test_new_baseline_keeps_tolerances_and_other_recordings(load, tmp_path):
+    gate, path = load("gate"), tmp_path / "baseline.json"
+    path.write_text(json.dumps({"tolerance": {"cpu_s": 0.7}, "ratios": {"a": {"cpu_s": 1.0}}}))
+    gate.write(path, {"b": {"cpu_s": 0.33333333}}, {"machine": "this one"})
+    assert gate.read(path) == {
+        "machine": "this one",
+        "tolerance": {"cpu_s": 0.7},
+        "ratios": {"a": {"cpu_s": 1.0}, "b": {"cpu_s": 0.3333}},
+    }
+
+
+def test_committed_baseline_covers_all_recordings(load):
+    gate, sequences = load("gate"), load("sequences")
+    baseline = gate.read(sequences.BASELINE)
+    assert set(baseline["tolerance"]) == set(gate.TOLERANCE)
+    assert set(baseline["ratios"]) == set(sequences.RECORDINGS)
+    for values in baseline["ratios"].values():
+        assert set(values) == set(gate.TOLERANCE)
+        assert all(np.isfinite(value) and value > 0 for value in values.values())
+
+
+@pytest.fixture
+def sequences(load, monkeypatch, tmp_path):
+    """Return the module with runs that are made up, and a baseline of its own."""
+    module = load("sequences")
+    monkeypatch.setattr(module, "BASELINE", tmp_path / "baseline.json")
+    for name in module.RECORDINGS:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "groundtruth.txt").touch()
+    (tmp_path / "vocabulary.txt").touch()
+    ours, peer = NUMBERS | COUNTS, {name: 2.0 * v for name, v in NUMBERS.items()} | COUNTS
+    monkeypatch.setattr(module, "compare", lambda *_: {"ours": [dict(ours)], "peer": [dict(peer)]})
+    made_up = {
+        "--data": tmp_path,
+        "--peer-python": sys.executable,
+        "--peer-script": __file__,
+        "--vocabulary": tmp_path / "vocabulary.txt",
+    }
+    given = [str(part) for pair in made_up.items() for part in pair]
+
+    def run(*arguments, **changes):
+        ours.update(changes)
+        monkeypatch.setattr(sys, "argv", ["sequences.py", *given, *arguments])
+        return module.main()
+
+    return run
+
+
+def test_gate_of_sequences(sequences, capsys):
+    assert sequences("--gate") == 1
+    assert "not in the baseline" in capsys.readouterr().out
+    assert sequences("--update-baseline") == 0
+    assert sequences("--gate") == 0
+    assert sequences("--gate", cpu_s=2.3) == 0
+    assert sequences("--gate", cpu_s=2.5) == 1
+    assert "regression: euroc_mh01: cpu_s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"ate_m": 0.0056}, "euroc_mh01: ATE 0.0056 m"),
+        ({"tracked": 109}, "euroc_mh01: 1 frames lost"),
+        ({"ms_p95": 43.0}, "p95: 0.72 of the peer's"),
+    ],
+)
+def test_missed_bars_close_the_gate_whatever_the_baseline(sequences, capsys, changes, said):
+    sequences("--update-baseline", **changes)
+    assert sequences("--gate") == 1
+    assert f"bar missed: {said}" in capsys.readouterr().out.replace("ms per frame, ", "").replace(
+        "euroc_mh01: p95", "p95"
+    )
+
+
+def test_baseline_is_of_default_settings(sequences, capsys):
+    with pytest.raises(SystemExit) as end:
+        sequences("--update-baseline", "--cv-threads", "1")
+    assert end.value.code == 2
+    assert "default settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("peer_python", None, "--peer-python is needed (or set ODOMAP_PEER_PYTHON)"),
+        ("peer_script", "/absent/x.py", "--peer-script: there is no /absent/x.py"),
+        ("data", "/absent", "--data: there is no /absent"),
+        ("vocabulary", "/absent/v.txt", "--vocabulary: there is no /absent/v.txt"),
+    ],
+)
+def test_what_is_missing_is_said_in_one_line(load, capsys, field, value, said):
+    peer = load("peer")
+    options = argparse.Namespace(
+        data=__file__, peer_python=sys.executable, peer_script=__file__, vocabulary=__file__
+    )
+    setattr(options, field, value)
+    with pytest.raises(SystemExit) as end:
+        peer.require(argparse.ArgumentParser(prog="it"), options)
+    assert end.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"it: {said}")
+    assert message.count("\n") == 1
