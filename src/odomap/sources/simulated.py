@@ -59,7 +59,9 @@ def read_spec(data: str | Path) -> WorldSpec:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml
+    import numpy as np
+import yaml
+from numpy.typing import NDArray
 
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -150,10 +152,15 @@ class SimulatedSource:
         self.name = f"sim:{spec.kind}?seed={spec.seed}&frames={spec.frames}"
         self.rig = self.world.rig
         self.truth: Trajectory | None = self.world.truth
+        self.stamps_ns: NDArray[np.int64] = self.world.truth.stamps_ns
         self.skipped: list[Skipped] = []
 
     def __len__(self) -> int:
         return len(self.world)
+
+    def frame(self, index: int) -> Frame:
+        """Render one frame, from 0 to len - 1."""
+        return self.world.frame(index)
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped = []
