@@ -208,18 +208,18 @@ def help_time() -> Lap:
 
 COLD_RUN = """
 import json, sys, time
-import odomap.run
-laps, last = [], [None, 0.0, 0.0]
-def progress(p):
-    name = f"{p.stage} {p.text}".strip()
-    if name != last[0]:
-        now = time.process_time(), time.perf_counter()
-        if last[0] is not None:
-            laps.append([last[0], now[0] - last[1], now[1] - last[2]])
-        last[:] = name, *now
-odomap.run.run(sys.argv[1], sys.argv[2], progress=progress)
+import odomap.kernels, odomap.run
+laps, warm_up = [], odomap.kernels.warm_up
+def timed(name):
+    start = time.process_time(), time.perf_counter()
+    warm_up(name)
+    laps.append([name, time.process_time() - start[0], time.perf_counter() - start[1]])
+odomap.kernels.warm_up = timed
+odomap.run.run(sys.argv[1], sys.argv[2])
+assert laps, "the run warmed up nothing"
 print(json.dumps(laps))
 """
+"""A run that tells how long each module with kernels took."""
 
 
 def cold_start() -> dict[str, Lap]:
@@ -233,14 +233,13 @@ def cold_start() -> dict[str, Lap]:
         for which in ("cold", "warm"):
             command = [sys.executable, "-c", COLD_RUN, str(recording), str(folder / which)]
             lap, said = _child(command, cache)
-            stages = [(stage, Lap(*times)) for stage, *times in json.loads(said.splitlines()[-1])]
-            parts = [(stage, part) for stage, part in stages if stage.startswith("compiling")]
+            parts = [(module, Lap(*times)) for module, *times in json.loads(said.splitlines()[-1])]
             cpu, wall = (sum(getattr(part, of) for _, part in parts) for of in ("cpu", "wall"))
             laps[f"{which}, compiling"] = Lap(cpu, wall)
             laps[f"{which}, whole run with report"] = lap
             if which == "cold":
                 parts.sort(key=lambda item: -item[1].cpu)
-                laps |= {f"cold, {stage.split('.', 1)[1]}": part for stage, part in parts[:8]}
+                laps |= {f"  {module}": part for module, part in parts[:8]}
     return laps
 
 
