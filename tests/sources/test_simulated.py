@@ -98,3 +98,12 @@ def test_wrong_names_are_named(tmp_path: Path) -> None:
         read_spec("sim:room?sed=3")
     with pytest.raises(InputError, match="cannot be read"):
         read_spec(tmp_path / "world.yaml")
+
+
+def test_it_can_be_played_there_and_back(source: SimulatedSource) -> None:
+    from odomap.sources.disturb import there_and_back
+
+    frames = list(source)
+    assert [f.stamp_ns for f in frames] == source.stamps_ns.tolist()
+    assert np.array_equal(source.frame(1).images[0], frames[1].images[0])
+    assert len(list(there_and_back(source))) == len(source)

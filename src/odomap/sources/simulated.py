@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import Any, get_type_hints
 from urllib.parse import parse_qsl
 
+import numpy as np
+from numpy.typing import NDArray
+
 from odomap.errors import ConfigError, InputError, OdomapError, nearest_name
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
@@ -59,9 +62,7 @@ def read_spec(data: str | Path) -> WorldSpec:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    import numpy as np
-import yaml
-from numpy.typing import NDArray
+    import yaml
 
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
