@@ -25,6 +25,7 @@ from odomap.backend.schur import (
     SightArrays,
     SystemArrays,
     back_substitute,
+    disparity_response,
     reduced_system,
     robust_cost,
 )
@@ -107,8 +108,10 @@ class BundleSolution:
         iterations: steps tried.
         reason: why it stopped.
         chi2: (N,) squared residuals in standard deviations; infinite behind the camera.
-        covariances: (K, 6, 6) of each pose given the fixed ones (zero for those), right tangent.
+        covariances: (K, 6, 6) of each pose given the fixed ones, right tangent; zero for those.
         joint_covariance: (6F, 6F) of all free poses in order; zero if the system is singular.
+        disparity_response: (K, 6) by which each pose moves, right tangent, per unit of one offset
+            in all disparities over focal length: what an error of the calibration would do.
         variance_factor: χ² per degree of freedom of the inlying observations: about 1 where the
             weights say the truth.
     """
@@ -122,6 +125,7 @@ class BundleSolution:
     chi2: Array
     covariances: Array
     joint_covariance: Array
+    disparity_response: Array
     variance_factor: float
 
 
@@ -146,6 +150,7 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
     poses, cameras, seen = _arrays(bundle, order)
     points = np.array(bundle.points_world, np.float64, order="C")
     chi2, joint, costs = np.empty(len(order)), np.zeros((6 * free, 6 * free)), np.zeros(2)
+    response = np.zeros(6 * free)
     tried, why = _solve_kernel(
         poses,
         points,
@@ -154,19 +159,31 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
         (config.huber_width, config.iterations, config.tolerance),
         chi2,
         joint,
+        response,
         costs,
     )
     Ts = np.array(bundle.Ts_world_body)
     Ts[:, :3, :3], Ts[:, :3, 3] = poses.R, poses.t
-    covariances = np.zeros((len(Ts), 6, 6))
+    covariances, responses = np.zeros((len(Ts), 6, 6)), np.zeros((len(Ts), 6))
     for k in np.flatnonzero(poses.column >= 0):
         f = 6 * poses.column[k]
         covariances[k] = joint[f : f + 6, f : f + 6]
+        responses[k] = response[f : f + 6]
     unsorted = np.empty(len(order))
     unsorted[order] = chi2
     factor = _variance_factor(bundle, unsorted, config.huber_width, free)
     return BundleSolution(
-        Ts, points, costs[0], costs[1], tried, REASONS[why], unsorted, covariances, joint, factor
+        Ts,
+        points,
+        costs[0],
+        costs[1],
+        tried,
+        REASONS[why],
+        unsorted,
+        covariances,
+        joint,
+        responses,
+        factor,
     )
 
 
@@ -225,6 +242,7 @@ def _solve_kernel(
     limits: tuple[float, int, float],
     chi2: Array,
     joint: Array,
+    response: Array,
     costs: Array,
 ) -> tuple[int, int]:
     """Levenberg-Marquardt, poses and points in place; returns steps tried and a reason's index."""
@@ -269,6 +287,9 @@ def _solve_kernel(
     reduced_system(poses, points, cameras, seen, width, 0.0, system)
     if factor(system.S):
         invert(system.S, joint)
+        disparity_response(poses, points, cameras, seen, width, system, response)
+        response[:] = -response
+        solve(system.S, response)
     else:
         reason = 3
     return tried, reason

@@ -20,14 +20,17 @@ Array = NDArray[np.float64]
 
 @kernel(reorder=True)
 def factor(A: Array) -> bool:
-    """Overwrite the lower triangle of A (n, n) with L; False if A is not positive definite."""
+    """Overwrite the lower triangle of A (n, n) with L; False if A is not positive definite.
+
+    A pivot that is 1e-10 of its diagonal is what rounding makes of zero.
+    """
     n = len(A)
     for j in range(n):
         row_j = A[j]
         pivot = row_j[j]
         for k in range(j):
             pivot -= row_j[k] * row_j[k]
-        if not pivot > 1e-14 * abs(A[j, j]) or not np.isfinite(pivot):
+        if not pivot > 1e-10 * abs(A[j, j]) or not np.isfinite(pivot):
             return False
         diagonal = np.sqrt(pivot)
         A[j, j] = diagonal

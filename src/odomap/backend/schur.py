@@ -29,6 +29,7 @@ __all__ = [
     "SightArrays",
     "SystemArrays",
     "back_substitute",
+    "disparity_response",
     "reduced_system",
     "robust_cost",
     "warm_up",
@@ -77,12 +78,12 @@ class SystemArrays(NamedTuple):
 
 @kernel(reorder=True)
 def invert_3x3(C: Array, inverse: Array) -> bool:
-    """Write the inverse of a symmetric 3x3 by its adjugate; False unless positive definite."""
+    """Write the inverse of a symmetric 3x3 by its adjugate; False where it is singular."""
     c00 = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
     c01 = C[0, 2] * C[1, 2] - C[0, 1] * C[2, 2]
     c02 = C[0, 1] * C[1, 2] - C[0, 2] * C[1, 1]
     det = C[0, 0] * c00 + C[0, 1] * c01 + C[0, 2] * c02
-    if not det > 1e-18 * C[0, 0] * C[1, 1] * C[2, 2]:
+    if not det > 1e-9 * C[0, 0] * C[1, 1] * C[2, 2]:
         return False
     scale = 1.0 / det
     inverse[0, 0], inverse[0, 1], inverse[0, 2] = c00 * scale, c01 * scale, c02 * scale
@@ -152,11 +153,16 @@ def reduced_system(
         for a in range(3):
             C[a, a] *= 1.0 + damping
         if not invert_3x3(C, system.C_inverse[m]):
-            # A direction that no observation constrains: hold the landmark in this step.
-            system.C_inverse[m, :, :] = 0.0
+            # Seen from one place only, its depth is unknown, and rounding errors in place of the
+            # zero would spoil S; a ten-millionth of what is known does not.
+            for a in range(3):
+                C[a, a] *= 1.0 + 1e-7
+            if not invert_3x3(C, system.C_inverse[m]):
+                system.C_inverse[m, :, :] = 0.0  # seen by nobody
         _eliminate(poses.column, seen, m, system, WC)
-    for a in range(len(s)):
-        S[a, a] += damping * diagonal[a] + 1e-12
+    if damping > 0.0:
+        for a in range(len(s)):
+            S[a, a] += damping * diagonal[a] + 1e-12  # a pose that nothing sees stays where it is
     return cost
 
 
@@ -180,6 +186,61 @@ def _eliminate(column: Index, seen: SightArrays, m: int, system: SystemArrays, W
                 x, y, z = WC[a, 0], WC[a, 1], WC[a, 2]
                 for b in range(6):
                     S[f + a, g + b] -= x * W[q, b, 0] + y * W[q, b, 1] + z * W[q, b, 2]
+
+
+@kernel(reorder=True)
+def disparity_response(
+    poses: PoseArrays,
+    points: Array,
+    cameras: CameraArrays,
+    seen: SightArrays,
+    width: float,
+    system: SystemArrays,
+    response: Array,
+) -> None:
+    """Write g (6F,), the gradient of the reduced problem per unit of one offset in all disparities.
+
+    With ∂r/∂δ = (0, 0, −w_d) the offset adds a = Σ Jᵀ w ∂r/∂δ and c = Σ Pᵀ w ∂r/∂δ, so that
+    g = a − W C⁻¹ c, and the poses move by −S⁻¹ g.
+    """
+    r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    c, y = np.empty(3), np.empty(3)
+    response[:] = 0.0
+    for m in range(len(points)):
+        c[:] = 0.0
+        for o in range(seen.start[m], seen.start[m + 1]):
+            i, k, f = seen.pose[o], seen.camera[o], poses.column[seen.pose[o]]
+            if np.isnan(seen.disparity[o]) or not reproject_with_jacobians(
+                poses.R[i],
+                poses.t[i],
+                cameras.R[k],
+                cameras.t[k],
+                cameras.baseline[k],
+                points[m],
+                seen.xy[o],
+                seen.disparity[o],
+                seen.weight[o],
+                r,
+                J,
+                P,
+            ):
+                continue
+            w = huber_weight(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], width)
+            w *= -seen.weight[o, 1]
+            for a in range(3):
+                c[a] += w * P[2, a]
+            if f >= 0:
+                for a in range(6):
+                    response[6 * f + a] += w * J[2, a]
+        C = system.C_inverse[m]
+        for a in range(3):
+            y[a] = C[a, 0] * c[0] + C[a, 1] * c[1] + C[a, 2] * c[2]
+        for o in range(seen.start[m], seen.start[m + 1]):
+            f = 6 * poses.column[seen.pose[o]]
+            if f >= 0:
+                W = system.W[o]
+                for a in range(6):
+                    response[f + a] -= W[a, 0] * y[0] + W[a, 1] * y[1] + W[a, 2] * y[2]
 
 
 @kernel(reorder=True)
@@ -247,3 +308,4 @@ def warm_up() -> None:
     robust_cost(poses, points, cameras, seen, 2.5, np.empty(1))
     reduced_system(poses, points, cameras, seen, 2.5, 1.0, system)
     back_substitute(poses, seen, system, points, np.empty((1, 3)))
+    disparity_response(poses, points, cameras, seen, 2.5, system, np.empty(6))

@@ -57,10 +57,10 @@ class WorldSpec:
     """Mean speed in m/s; 0 for 0.6 in a room and 7.5 in a street."""
     noise: float = 1.0
     """Factor on all imperfections of all sensors; 0 for ideal ones."""
-    calibration_px: float = 0.0
+    calibration_px: float = 0.1
     """How wrong the rig's calibration is at most: principal point, focal length (at the image's
-    rim) and rotation of each camera, in pixels. Real rigs are off by 0.1 or so; no sensor noise
-    averages that out."""
+    rim) and rotation of each camera, in pixels, times `noise`. Real rigs are off by 0.1 or so; no
+    amount of images averages that out."""
     moving_objects: int = 0
     """How many things move through the scene."""
     sensors: tuple[str, ...] = ("stereo", "imu")
@@ -271,10 +271,10 @@ def _carried(spec: WorldSpec) -> Rig:
 
 def _miscalibrated(mount: CameraMount, spec: WorldSpec, number: int) -> CameraMount:
     """Return what the camera really is where the rig describes it wrongly."""
-    if spec.calibration_px == 0:
+    if spec.calibration_px * spec.noise == 0:
         return mount
     camera = mount.camera
-    off = spec.calibration_px * np.random.default_rng([spec.seed, number, 19]).uniform(-1, 1, 6)
+    off = spec.calibration_px * spec.noise * np.random.default_rng([spec.seed, number, 19]).uniform(-1, 1, 6)
     focal = camera.fx + off[0] * 2 * camera.fx / camera.width
     true = replace(
         camera, intrinsics=np.array([focal, focal, camera.cx + off[1], camera.cy + off[2]])

@@ -108,9 +108,10 @@ class Locator:
             points_world[rows], self._normalised(pixels), np.full(len(rows), np.nan), weights
         )
         solution = self._solve(T_world_body, sightings)
+        factor = self._noise.overlap * _variance_factor(solution)
         return Located(
             solution.T_world_body,
-            solution.covariance,
+            factor * solution.covariance,
             rows,
             pixels,
             solution.inliers & solution.converged,
@@ -156,3 +157,9 @@ class Locator:
         return np.asarray(
             f / np.stack([sigma, np.full(len(sigma), self._noise.disparity_px)], axis=1)
         )
+
+
+def _variance_factor(solution: MotionSolution) -> float:
+    """Return χ² per degree of freedom of the inliers: 1 where the weights say the truth."""
+    freedom = 2 * int(solution.inliers.sum()) - 6
+    return float(solution.chi2[solution.inliers].sum() / freedom) if freedom > 0 else 1.0

@@ -5,16 +5,9 @@ keyframes just before them. Observations that disagree with the solution have li
 (Huber) and are dropped for the next; keyframes that leave the window are retired, so that memory
 stays flat.
 
-Covariance. The window gives each keyframe's covariance S given the fixed ones. Its uncertainty in
-the world adds that of the keyframe a that ties the window, as it was when a was the newest:
+How sure the newest keyframe's pose is in the world then follows from the solution (`uncertainty`).
 
-    Σ_k = Ad(T_k_a) Σ_a Ad(T_k_a)ᵀ + S_k.
-
-Spans of one window each are chained this way, not neighbouring keyframes: consecutive steps share
-their landmarks and with it their errors, which a sum over every step would count again and again.
-
-Reference: Mouragnon et al., "Real Time Localization and 3D Reconstruction", CVPR 2006; Barfoot,
-Furgale, "Associating Uncertainty With Three-Dimensional Poses", T-RO 2014.
+Reference: Mouragnon et al., "Real Time Localization and 3D Reconstruction", CVPR 2006.
 """
 
 from dataclasses import dataclass
@@ -23,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bundle
-from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.system.stages import Loop
+from odomap.system.uncertainty import Calibration, Drift
 from odomap.vision.stereo import StereoNoise
 
 __all__ = ["WindowChange", "WindowConfig", "WindowJob", "WindowMapper"]
@@ -70,7 +64,9 @@ class WindowMapper:
         self._map, self._window, self._bundle, self._noise = map, window, bundle, noise
         self._T_camera_body = se3_inverse(T_body_camera)
         self._focal, self._baseline = focal, baseline
+        self._calibration = Calibration.of(noise, focal, T_body_camera)
         self._recent: list[int] = []
+        self._drifts: dict[int, Drift] = {}
 
     def add(self, keyframe: Keyframe) -> "WindowJob | None":
         """Take in a keyframe that is in the map, and read the window that it ends."""
@@ -84,15 +80,33 @@ class WindowMapper:
             return None
         held = max(1, len(self._recent) - size)
         snapshot = self._map.snapshot(self._recent[held:], self._recent[:held])
-        anchor = int(snapshot.keyframe_ids[np.flatnonzero(snapshot.is_fixed)[-1]])
         return WindowJob(
+            self,
             snapshot,
             self._make_bundle(snapshot),
             self._bundle,
             self._window.gate,
-            self._map.covariance(anchor),
+            self._drift(self._recent[held - 1]),
+            self._noise.overlap,
             tuple(leaving),
         )
+
+    def write(self, change: "WindowChange", map: Map) -> None:
+        """Write a solved window into the map: poses, landmarks, and how sure the newest pose is."""
+        newest = change.newest_id
+        with map.lock:
+            map.apply(change.update)
+            self._drifts[newest] = change.drift
+            covariance = self._calibration.total(change.drift, map.T_world_body(newest))
+            map.set_covariance([newest], covariance)
+            map.retire_keyframes(change.leaving)
+            for keyframe_id in change.leaving:
+                self._drifts.pop(keyframe_id, None)
+
+    def _drift(self, keyframe_id: int) -> Drift:
+        """Return a keyframe's drift; where odometry began, what the tracker said of it."""
+        begun = Drift(self._map.covariance(keyframe_id), np.zeros(6))
+        return self._drifts.get(keyframe_id, begun)
 
     def _make_bundle(self, snapshot: Snapshot) -> Bundle:
         """Gather what the keyframes measured, in the order of the snapshot's observations."""
@@ -128,19 +142,23 @@ class WindowJob:
     """A window read from the map, ready to be solved.
 
     Attributes:
+        mapper: whose window it is.
         snapshot: the window.
         bundle: its observations.
         config: of the solver.
         gate: residual beyond which an observation is dropped, standard deviations.
-        anchor_covariance: (6, 6) of the newest keyframe that is held fixed.
+        anchor_drift: of the newest keyframe that is held fixed.
+        overlap: factor on variances for errors that observations share.
         leaving: keyframes that have left the window.
     """
 
+    mapper: WindowMapper
     snapshot: Snapshot
     bundle: Bundle
     config: BundleConfig
     gate: float
-    anchor_covariance: Array
+    anchor_drift: Drift
+    overlap: float
     leaving: tuple[int, ...]
 
     def solve(self) -> "WindowChange":
@@ -149,22 +167,12 @@ class WindowJob:
         wrong = np.flatnonzero(solution.chi2 > self.gate**2)
         update = self.snapshot.solved(solution.Ts_world_body, solution.points_world, dropped=wrong)
         newest = int(np.flatnonzero(~self.snapshot.is_fixed)[-1])
-        return WindowChange(
-            update,
-            int(self.snapshot.keyframe_ids[newest]),
-            self._world_covariance(solution, newest),
-            self.leaving,
-            solution,
-        )
-
-    def _world_covariance(self, solution: BundleSolution, newest: int) -> Array:
-        """Chain the covariance of the newest keyframe to that of the anchor."""
         anchor = int(np.flatnonzero(self.snapshot.is_fixed)[-1])
         Ts = solution.Ts_world_body
-        Ad = se3_adjoint(se3_inverse(Ts[newest]) @ Ts[anchor])
-        factor = max(1.0, solution.variance_factor)
-        relative = factor * solution.covariances[newest]
-        return np.asarray(Ad @ self.anchor_covariance @ Ad.T + relative)
+        T_newest_anchor = se3_inverse(Ts[newest]) @ Ts[anchor]
+        drift = self.anchor_drift.onwards(T_newest_anchor, solution, newest, self.overlap)
+        newest_id = int(self.snapshot.keyframe_ids[newest])
+        return WindowChange(self.mapper, update, newest_id, drift, self.leaving, solution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,23 +180,22 @@ class WindowChange:
     """A solved window, to be written into the map.
 
     Attributes:
+        mapper: whose window it is.
         update: poses and landmarks.
         newest_id: the keyframe that ended the window.
-        covariance: (6, 6) of its pose in the world.
+        drift: how unsure its pose in the world is.
         leaving: keyframes that have left the window.
         solution: what the solver said.
     """
 
+    mapper: WindowMapper
     update: Update
     newest_id: int
-    covariance: Array
+    drift: Drift
     leaving: tuple[int, ...]
     solution: BundleSolution
     loops: tuple[Loop, ...] = ()
 
     def write(self, map: Map) -> None:
         """Move the window, and retire what has left it."""
-        with map.lock:
-            map.apply(self.update)
-            map.set_covariance([self.newest_id], self.covariance)
-            map.retire_keyframes(self.leaving)
+        self.mapper.write(self, map)

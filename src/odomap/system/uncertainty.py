@@ -1,0 +1,95 @@
+"""Uncertainty of an odometry's keyframes: what noise and what the calibration do to the path.
+
+Noise. A window gives its newest keyframe's covariance S given the keyframe a that ties the window.
+In the world it adds to that of a, as it was when a was the newest,
+
+    Σ_k = Ad(T_k_a) Σ_a Ad(T_k_a)ᵀ + f S_k.
+
+Spans of one window each are chained, not neighbouring keyframes: consecutive steps share their
+landmarks and so their errors, which a sum over every step would count again and again. f is the
+variance factor found in the residuals times a factor for errors that observations share.
+
+Calibration. No amount of data averages out what the rig says wrongly. One offset δ in all
+disparities moves the newest keyframe by k_k (the solver's response) given a, along the path
+g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another direction by θ than its mount says moves a
+pose T by (Ad(T⁻¹) − I) θ. Both stay in the error to the end, so they are carried as responses and
+only squared when asked for (a "consider" covariance):
+
+    Σ = Σ_k + σ_δ² g_k g_kᵀ + σ_θ² M Mᵀ.
+
+Reference: Schmidt, "Application of state-space methods to navigation problems", 1966; Barfoot,
+Furgale, "Associating Uncertainty With Three-Dimensional Poses", T-RO 2014.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend.bundle import BundleSolution
+from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.vision.stereo import StereoNoise
+
+__all__ = ["Calibration", "Drift"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """How unsure a keyframe's pose in the world is, apart from what is not random.
+
+    Attributes:
+        covariance: (6, 6) due to noise, right tangent.
+        response: (6,) motion of the pose per unit of disparity offset over focal length.
+    """
+
+    covariance: Array
+    response: Array
+
+    def onwards(
+        self, T_newest_anchor: Array, solution: BundleSolution, newest: int, overlap: float
+    ) -> "Drift":
+        """Return the drift of a window's newest keyframe, this being that of its anchor.
+
+        Args:
+            T_newest_anchor: (4, 4).
+            solution: of the window.
+            newest: its row in the solution.
+            overlap: factor for errors that observations share.
+        """
+        Ad = se3_adjoint(T_newest_anchor)
+        factor = overlap * solution.variance_factor
+        return Drift(
+            Ad @ self.covariance @ Ad.T + factor * solution.covariances[newest],
+            Ad @ self.response + solution.disparity_response[newest],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """How far the calibration may be off, as standard deviations.
+
+    Attributes:
+        disparity: of one offset in all disparities, over focal length.
+        direction: of the camera's direction about each axis, radians.
+        Ad_body_camera: (6, 6) adjoint of the camera's mount.
+    """
+
+    disparity: float
+    direction: float
+    Ad_body_camera: Array
+
+    @staticmethod
+    def of(noise: StereoNoise, focal: float, T_body_camera: Array) -> "Calibration":
+        """Take the standard deviations of a configuration."""
+        sigma = noise.calibration_px / focal
+        return Calibration(sigma, sigma, se3_adjoint(T_body_camera))
+
+    def total(self, drift: Drift, T_world_body: Array) -> Array:
+        """Return the (6, 6) covariance of a pose, calibration included."""
+        mount = (se3_adjoint(se3_inverse(T_world_body)) - np.eye(6)) @ self.Ad_body_camera[:, 3:]
+        offset = self.disparity * drift.response
+        return np.asarray(
+            drift.covariance + np.outer(offset, offset) + self.direction**2 * mount @ mount.T
+        )
