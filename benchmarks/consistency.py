@@ -1,7 +1,8 @@
 """Simulated worlds of many seeds: is the path right, and do its covariances say how wrong it is?
 
     python benchmarks/consistency.py [--seeds 5] [--frames 150] [--kinds room street]
-                                     [--cache DIR] [--jobs N] [--set NAME=VALUE] [--json FILE]
+                                     [--world FIELD=VALUE] [--cache DIR] [--jobs N]
+                                     [--set NAME=VALUE] [--json FILE]
 
 Per world: RMSE of the absolute trajectory error in percent of the path, frames without a pose, and
 the mean over frames of the normalised error squared per degree of freedom, eᵀ P⁻¹ e / 6, which is
@@ -35,6 +36,7 @@ from odomap.run import chosen_config
 from odomap.simulation.export import export_euroc
 from odomap.simulation.world import World
 from odomap.sources.open import open as open_source
+from odomap.sources.simulated import read_spec
 from odomap.sources.source import Source
 from odomap.system.odometry import StereoVO
 
@@ -50,7 +52,7 @@ class Job:
     kind: str
     seed: int
     frames: int
-    moving_objects: int
+    world: tuple[str, ...]
     cache: str | None
     assignments: tuple[tuple[str, str], ...]
 
@@ -82,7 +84,7 @@ def main() -> int:
     options = _options()
     assignments = tuple(tuple(text.split("=", 1)) for text in options.set)
     jobs = [
-        Job(kind, seed, options.frames, options.moving_objects, options.cache, assignments)
+        Job(kind, seed, options.frames, tuple(options.world), options.cache, assignments)
         for kind in options.kinds
         for seed in range(options.first_seed, options.first_seed + options.seeds)
     ]
@@ -112,7 +114,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=5, help="worlds of each kind")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=150)
-    parser.add_argument("--moving-objects", type=int, default=0)
+    parser.add_argument(
+        "--world", action="append", default=[], metavar="FIELD=VALUE", help="e.g. moving_objects=3"
+    )
     parser.add_argument("--cache", metavar="DIR", help="keep rendered worlds here")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
@@ -144,20 +148,16 @@ def run(job: Job) -> Row:
 
 def open_world(job: Job) -> Source:
     """Return the source of a world, rendered as it is read or kept from an earlier time."""
-    moving = f"&moving_objects={job.moving_objects}" if job.moving_objects else ""
-    name = f"sim:{job.kind}?seed={job.seed}&frames={job.frames}{moving}"
+    name = f"sim:{job.kind}?" + "&".join((f"seed={job.seed}", f"frames={job.frames}", *job.world))
     if job.cache is None:
         return open_source(name)
-    label = f"{job.kind}-{job.seed}-{job.frames}-{job.moving_objects}-{simulation_hash()}"
-    folder = Path(job.cache) / label
+    label = name.removeprefix("sim:").replace("?", "&").replace("&", "-")
+    folder = Path(job.cache) / f"{label}-{simulation_hash()}"
     if not folder.exists():
         # Under another name until it is whole: an interrupted run must not leave half a world.
-        part = folder.with_name(f"{label}.part")
+        part = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
-        world = World.make(
-            kind=job.kind, seed=job.seed, frames=job.frames, moving_objects=job.moving_objects
-        )
-        export_euroc(world, part).rename(folder)
+        export_euroc(World(read_spec(name)), part).rename(folder)
     return open_source(folder)
 
 

@@ -17,15 +17,13 @@ more than twice as easy.
 
 import argparse
 import json
-import lzma
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from statistics import median
 
 import numpy as np
+import peer
 
 from odomap.evaluation.metrics import ate
 from odomap.files.trajectories import read_tum
@@ -46,12 +44,15 @@ def main() -> int:
     options = _options()
     with tempfile.TemporaryDirectory(prefix="realism-") as folder:
         scratch = Path(folder)
-        vocabulary = _unpacked(options.vocabulary, scratch)
+        vocabulary = peer.unpacked(options.vocabulary, scratch)
 
-        def peer(layout: str, data: Path, truth: Trajectory) -> dict[str, float]:
-            return _run_peer(options, vocabulary, layout, data, truth, scratch / "peer")
+        def run_peer(layout: str, data: Path, truth: Trajectory) -> dict[str, float]:
+            played = peer.run(options, vocabulary, layout, data, scratch / "peer")
+            result = ate(played.trajectory(), truth)
+            path = {"percent": result.percent, "path_m": result.path_m}
+            return path | played.numbers(truth)
 
-        rows = [_compare(options, peer, scratch, *pair) for pair in PAIRS]
+        rows = [_compare(options, run_peer, scratch, *pair) for pair in PAIRS]
     print(
         f"\n{'world':8} {'real clip':14} {'real %':>8} {'rendered %':>11} {'ratio':>6}"
         f" {'ours real %':>12} {'ours rendered %':>16}"
@@ -72,35 +73,17 @@ def main() -> int:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    env = os.environ.get
-    parser.add_argument("--data", default=env("ODOMAP_DATA"), help="folder of the real clips")
-    parser.add_argument("--peer-python", default=env("ODOMAP_PEER_PYTHON"))
-    parser.add_argument("--peer-script", default=env("ODOMAP_PEER_SCRIPT"))
-    parser.add_argument("--vocabulary", help="default: DATA/peer/orb_vocabulary.txt.xz")
+    peer.add_options(parser)
     parser.add_argument("--seeds", type=int, default=3, help="rendered worlds of each kind")
     parser.add_argument("--runs", type=int, default=3, help="runs on each real clip")
     parser.add_argument("--calibration-px", type=float, default=0.0, help="of the rendered rigs")
     parser.add_argument("--json", help="write the numbers here")
     options = parser.parse_args()
-    for name in ("data", "peer_python", "peer_script"):
-        if not getattr(options, name):
-            flag = "--" + name.replace("_", "-")
-            parser.error(f"{flag} is needed (or ODOMAP_{name.upper()})")
-    options.vocabulary = options.vocabulary or f"{options.data}/peer/orb_vocabulary.txt.xz"
+    peer.require(parser, options)
     return options
 
 
-def _unpacked(vocabulary: str, scratch: Path) -> Path:
-    """Unpack the vocabulary once rather than at every run."""
-    if not vocabulary.endswith(".xz"):
-        return Path(vocabulary)
-    plain = scratch / "vocabulary.txt"
-    with lzma.open(vocabulary) as packed:
-        plain.write_bytes(packed.read())
-    return plain
-
-
-def _compare(options, peer, scratch, kind, clip, layout, fields) -> dict[str, object]:
+def _compare(options, run_peer, scratch, kind, clip, layout, fields) -> dict[str, object]:
     """Run the peer on a real clip and on rendered ones of the same length."""
     real = Path(options.data) / clip
     truth = read_tum(real / "groundtruth.txt")
@@ -112,12 +95,12 @@ def _compare(options, peer, scratch, kind, clip, layout, fields) -> dict[str, ob
     spec = {**fields, "frames": len(stamps), "speed": matched.path_length / seconds}
     spec["calibration_px"] = options.calibration_px
     print(f"{clip}: {len(stamps)} frames, {matched.path_length:.2f} m, {spec['speed']:.2f} m/s")
-    real_runs = [peer(layout, real, matched) for _ in range(options.runs)]
+    real_runs = [run_peer(layout, real, matched) for _ in range(options.runs)]
     rendered_runs, ours = [], []
     for seed in range(options.seeds):
         world = World.make(kind=kind, seed=seed, **spec)
         folder = export_euroc(world, scratch / f"{kind}{seed}")
-        rendered_runs.append(peer("euroc", folder, world.truth))
+        rendered_runs.append(run_peer("euroc", folder, world.truth))
         ours.append(_run_ours(folder, world.truth))
     for name, runs in ((clip, real_runs), (f"rendered {kind}", rendered_runs)):
         for run in runs:
@@ -142,24 +125,6 @@ def _image_stamps(folder: Path, layout: str) -> np.ndarray:
         rows = (folder / "mav0/cam0/data.csv").read_text(encoding="utf-8").splitlines()
         return np.array([int(row.split(",")[0]) for row in rows if row[:1].isdigit()], np.int64)
     return np.rint(np.loadtxt(folder / "times.txt") * 1e9).astype(np.int64)
-
-
-def _run_peer(options, vocabulary, layout, data, truth, prefix) -> dict[str, float]:
-    command = [options.peer_python, options.peer_script, layout, str(data), "--mode", "stereo"]
-    command += ["--vocab", str(vocabulary), "--out", str(prefix), "--pace"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        sys.exit(f"the peer failed on {data}:\n{done.stderr[-2000:]}")
-    said = json.loads(done.stdout.strip().splitlines()[-1])
-    result = ate(read_tum(Path(f"{prefix}.tum")), truth)
-    return {
-        "percent": result.percent,
-        "ate_m": result.rmse,
-        "path_m": result.path_m,
-        "frames": said["frames"],
-        "tracked": said["states"].get("OK", 0),
-        "ms_median": said["ms_median"],
-    }
 
 
 def _run_ours(data: Path, truth: Trajectory) -> float:

@@ -201,7 +201,7 @@ def print_table(
     """Print median [smallest to largest] of both and the ratio of the medians."""
     frames = int(runs["ours"][0]["frames"])
     threads = {who: int(several[0]["cv_threads"]) for who, several in runs.items()}
-    print(f"\n{name}: {frames} frames, {len(runs['ours'])} runs, times from frame {SKIPPED} on")
+    print(f"\n{name}: {frames} frames, {len(runs['ours'])} runs, times without the first {SKIPPED}")
     print(f"OpenCV threads: {threads['ours']} in odomap; {threads['peer']} in the peer's reader,")
     print("its own OpenCV inside and its three threads are as it was built")
     print(f"{'':22}{'odomap':>26}{'ORB-SLAM3':>26}{'ratio':>8}")

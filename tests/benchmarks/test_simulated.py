@@ -26,7 +26,7 @@ def test_bars_of_consistency(load):
 
 def test_half_a_world_is_not_kept(load, monkeypatch, tmp_path):
     consistency = load("consistency")
-    job = consistency.Job("room", 0, 2, 0, str(tmp_path), ())
+    job = consistency.Job("room", 0, 2, ("noise=0",), str(tmp_path), ())
 
     def interrupted(world, folder):
         folder.mkdir()
