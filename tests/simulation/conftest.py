@@ -13,6 +13,7 @@ def ideal_room() -> World:
 @pytest.fixture(scope="session")
 def noisy_room() -> World:
     return World.make(
+        calibration_px=0.0,
         kind="room",
         seed=5,
         frames=6,

@@ -127,7 +127,9 @@ def test_disparity_has_no_bias(noise: float) -> None:
 
 def disparity_errors(seed: int, noise: float) -> np.ndarray:
     """Photometric disparity minus the true one at corners away from depth edges, pixels."""
-    world = World.make(kind="room", seed=seed, frames=40, noise=noise, sensors=("stereo",))
+    world = World.make(
+        kind="room", seed=seed, frames=40, noise=noise, calibration_px=0, sensors=("stereo",)
+    )
     left, right = world.rig.stereo_pair()
     baseline = (left.T_body_camera.inverse() @ right.T_body_camera).t[0]
     errors = []
