@@ -88,13 +88,28 @@ class Bundle:
             raise InputError(
                 f"bundle: observation arrays differ in length ({n} and {sorted(lengths)})"
             )
-        if n and (
-            self.pose.max() >= len(self.Ts_world_body) or self.point.max() >= len(self.points_world)
+        if len(self.is_fixed) != len(self.Ts_world_body):
+            raise InputError("bundle: is_fixed and Ts_world_body differ in length")
+        for name, known in (
+            ("pose", self.Ts_world_body),
+            ("point", self.points_world),
+            ("camera", self.Ts_camera_body),
         ):
-            raise InputError("bundle: an observation names a pose or landmark that does not exist")
-        for name in ("Ts_world_body", "points_world", "xy", "weights"):
+            named = getattr(self, name)
+            if n and not 0 <= named.min() <= named.max() < len(known):
+                raise InputError(f"bundle: an observation names a {name} that does not exist")
+        for name in (
+            "Ts_world_body",
+            "points_world",
+            "Ts_camera_body",
+            "baselines",
+            "xy",
+            "weights",
+        ):
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(f"bundle: {name} holds a value that is not finite")
+        if np.isinf(self.disparity).any():
+            raise InputError("bundle: a disparity is infinite; one that is not known is NaN")
 
 
 @dataclass(frozen=True)

@@ -155,8 +155,9 @@ def reduced_system(
         if not invert_3x3(C, system.C_inverse[m]):
             # Seen from one place only, its depth is unknown, and rounding errors in place of the
             # zero would spoil S; a ten-millionth of what is known does not.
+            trace = C[0, 0] + C[1, 1] + C[2, 2]
             for a in range(3):
-                C[a, a] *= 1.0 + 1e-7
+                C[a, a] += 1e-7 * trace
             if not invert_3x3(C, system.C_inverse[m]):
                 system.C_inverse[m, :, :] = 0.0  # seen by nobody
         _eliminate(poses.column, seen, m, system, WC)
