@@ -132,7 +132,7 @@ def _solve_kernel(
     r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
     H, b = np.empty((6, 6)), np.empty(6)
     R_new, t_new = np.empty((3, 3)), np.empty(3)
-    converged = False
+    converged, size = False, np.inf
     for phase in range(2):
         for o in range(len(xy)):
             in_front = reproject(
@@ -172,8 +172,10 @@ def _solve_kernel(
             R, t, R_cb, t_cb, baseline, points[o], xy[o], disparity[o], weights[o], r
         )
         chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if in_front else np.inf
+    if not converged and size >= 1e-3:
+        return False
     invert(H, covariance)
-    return converged or size < 1e-3
+    return True
 
 
 def warm_up() -> None:
