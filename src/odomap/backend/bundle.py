@@ -125,8 +125,9 @@ class BundleSolution:
         chi2: (N,) squared residuals in standard deviations; infinite behind the camera.
         covariances: (K, 6, 6) of each pose given the fixed ones, right tangent; zero for those.
         joint_covariance: (6F, 6F) of all free poses in order; zero if the system is singular.
-        disparity_response: (K, 6) by which each pose moves, right tangent, per unit of one offset
-            in all disparities over focal length: what an error of the calibration would do.
+        disparity_responses: (K, 3, 6) by which each pose moves, right tangent, per unit of error in
+            all disparities over focal length: an offset, and slopes in x and in y of the normalised
+            image. What errors of the calibration would do.
         variance_factor: χ² per degree of freedom of the inlying observations: about 1 where the
             weights say the truth.
     """
@@ -140,7 +141,7 @@ class BundleSolution:
     chi2: Array
     covariances: Array
     joint_covariance: Array
-    disparity_response: Array
+    disparity_responses: Array
     variance_factor: float
 
 
@@ -165,7 +166,7 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
     poses, cameras, seen = _arrays(bundle, order)
     points = np.array(bundle.points_world, np.float64, order="C")
     chi2, joint, costs = np.empty(len(order)), np.zeros((6 * free, 6 * free)), np.zeros(2)
-    response = np.zeros(6 * free)
+    response = np.zeros((3, 6 * free))
     tried, why = _solve_kernel(
         poses,
         points,
@@ -179,11 +180,11 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
     )
     Ts = np.array(bundle.Ts_world_body)
     Ts[:, :3, :3], Ts[:, :3, 3] = poses.R, poses.t
-    covariances, responses = np.zeros((len(Ts), 6, 6)), np.zeros((len(Ts), 6))
+    covariances, responses = np.zeros((len(Ts), 6, 6)), np.zeros((len(Ts), 3, 6))
     for k in np.flatnonzero(poses.column >= 0):
         f = 6 * poses.column[k]
         covariances[k] = joint[f : f + 6, f : f + 6]
-        responses[k] = response[f : f + 6]
+        responses[k] = response[:, f : f + 6]
     unsorted = np.empty(len(order))
     unsorted[order] = chi2
     factor = _variance_factor(bundle, unsorted, config.huber_width, free)
@@ -303,8 +304,9 @@ def _solve_kernel(
     if factor(system.S):
         invert(system.S, joint)
         disparity_response(poses, points, cameras, seen, width, system, response)
-        response[:] = -response
-        solve(system.S, response)
+        for e in range(3):
+            response[e] = -response[e]
+            solve(system.S, response[e])
     else:
         reason = 3
     return tried, reason

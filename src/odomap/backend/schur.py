@@ -199,16 +199,16 @@ def disparity_response(
     system: SystemArrays,
     response: Array,
 ) -> None:
-    """Write g (6F,), the gradient of the reduced problem per unit of one offset in all disparities.
+    """Write g (3, 6F), gradients of the reduced problem per unit of error in all disparities.
 
-    With ∂r/∂δ = (0, 0, −w_d) the offset adds a = Σ Jᵀ w ∂r/∂δ and c = Σ Pᵀ w ∂r/∂δ, so that
-    g = a − W C⁻¹ c, and the poses move by −S⁻¹ g.
+    The error is an offset, or a slope in x or y: δ(x, y) = 1, x, y. With ∂r/∂δ = (0, 0, −w_d δ) it
+    adds a = Σ Jᵀ w ∂r/∂δ and c = Σ Pᵀ w ∂r/∂δ, so that g = a − W C⁻¹ c and poses move by −S⁻¹ g.
     """
     r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
-    c, y = np.empty(3), np.empty(3)
-    response[:] = 0.0
+    c, shape = np.empty((3, 3)), np.ones(3)
+    response[:, :] = 0.0
     for m in range(len(points)):
-        c[:] = 0.0
+        c[:, :] = 0.0
         for o in range(seen.start[m], seen.start[m + 1]):
             i, k, f = seen.pose[o], seen.camera[o], poses.column[seen.pose[o]]
             if np.isnan(seen.disparity[o]) or not reproject_with_jacobians(
@@ -227,21 +227,25 @@ def disparity_response(
             ):
                 continue
             w = huber_weight(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], width)
-            w *= -seen.weight[o, 1]
-            for a in range(3):
-                c[a] += w * P[2, a]
-            if f >= 0:
-                for a in range(6):
-                    response[6 * f + a] += w * J[2, a]
-        C = system.C_inverse[m]
-        for a in range(3):
-            y[a] = C[a, 0] * c[0] + C[a, 1] * c[1] + C[a, 2] * c[2]
+            shape[1], shape[2] = seen.xy[o, 0], seen.xy[o, 1]
+            for e in range(3):
+                pull = -w * seen.weight[o, 1] * shape[e]
+                for a in range(3):
+                    c[e, a] += pull * P[2, a]
+                if f >= 0:
+                    for a in range(6):
+                        response[e, 6 * f + a] += pull * J[2, a]
         for o in range(seen.start[m], seen.start[m + 1]):
             f = 6 * poses.column[seen.pose[o]]
-            if f >= 0:
-                W = system.W[o]
-                for a in range(6):
-                    response[f + a] -= W[a, 0] * y[0] + W[a, 1] * y[1] + W[a, 2] * y[2]
+            if f < 0:
+                continue
+            for e in range(3):
+                for b in range(3):
+                    y = 0.0
+                    for a in range(3):
+                        y += system.C_inverse[m, b, a] * c[e, a]
+                    for a in range(6):
+                        response[e, f + a] -= system.W[o, a, b] * y
 
 
 @kernel(reorder=True)
@@ -309,4 +313,4 @@ def warm_up() -> None:
     robust_cost(poses, points, cameras, seen, 2.5, np.empty(1))
     reduced_system(poses, points, cameras, seen, 2.5, 1.0, system)
     back_substitute(poses, seen, system, points, np.empty((1, 3)))
-    disparity_response(poses, points, cameras, seen, 2.5, system, np.empty(6))
+    disparity_response(poses, points, cameras, seen, 2.5, system, np.empty((3, 6)))

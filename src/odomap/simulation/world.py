@@ -274,7 +274,8 @@ def _miscalibrated(mount: CameraMount, spec: WorldSpec, number: int) -> CameraMo
     if spec.calibration_px * spec.noise == 0:
         return mount
     camera = mount.camera
-    off = spec.calibration_px * spec.noise * np.random.default_rng([spec.seed, number, 19]).uniform(-1, 1, 6)
+    rng = np.random.default_rng([spec.seed, number, 19])
+    off = spec.calibration_px * spec.noise * rng.uniform(-1, 1, 6)
     focal = camera.fx + off[0] * 2 * camera.fx / camera.width
     true = replace(
         camera, intrinsics=np.array([focal, focal, camera.cx + off[1], camera.cy + off[2]])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bundle
+from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
@@ -47,7 +48,7 @@ class WindowMapper:
     Args:
         map: where keyframes and landmarks are.
         T_body_camera: (4, 4) mount of the rectified left camera.
-        focal: of the rectified camera, pixels.
+        camera: the rectified camera.
         baseline: metres.
     """
 
@@ -55,7 +56,7 @@ class WindowMapper:
         self,
         map: Map,
         T_body_camera: Array,
-        focal: float,
+        camera: Camera,
         baseline: float,
         window: WindowConfig,
         bundle: BundleConfig,
@@ -63,8 +64,8 @@ class WindowMapper:
     ) -> None:
         self._map, self._window, self._bundle, self._noise = map, window, bundle, noise
         self._T_camera_body = se3_inverse(T_body_camera)
-        self._focal, self._baseline = focal, baseline
-        self._calibration = Calibration.of(noise, focal, T_body_camera)
+        self._focal, self._baseline = camera.fx, baseline
+        self._calibration = Calibration.of(noise, camera, T_body_camera)
         self._recent: list[int] = []
         self._drifts: dict[int, Drift] = {}
 
@@ -105,7 +106,7 @@ class WindowMapper:
 
     def _drift(self, keyframe_id: int) -> Drift:
         """Return a keyframe's drift; where odometry began, what the tracker said of it."""
-        begun = Drift(self._map.covariance(keyframe_id), np.zeros(6))
+        begun = Drift(self._map.covariance(keyframe_id), np.zeros((3, 6)))
         return self._drifts.get(keyframe_id, begun)
 
     def _make_bundle(self, snapshot: Snapshot) -> Bundle:

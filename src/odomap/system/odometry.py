@@ -71,7 +71,7 @@ class StereoVO:
         mapper = WindowMapper(
             self.map,
             rectifier.T_body_camera,
-            rectifier.camera.fx,
+            rectifier.camera,
             rectifier.baseline,
             config.window,
             config.bundle,

@@ -9,13 +9,13 @@ Spans of one window each are chained, not neighbouring keyframes: consecutive st
 landmarks and so their errors, which a sum over every step would count again and again. f is the
 variance factor found in the residuals times a factor for errors that observations share.
 
-Calibration. No amount of data averages out what the rig says wrongly. One offset δ in all
-disparities moves the newest keyframe by k_k (the solver's response) given a, along the path
-g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another direction by θ than its mount says moves a
-pose T by (Ad(T⁻¹) − I) θ. Both stay in the error to the end, so they are carried as responses and
-only squared when asked for (a "consider" covariance):
+Calibration. No amount of data averages out what the rig says wrongly. An error δ of all
+disparities, an offset or a slope across the image, moves the newest keyframe by k_k (the solver's
+response) given a, along the path by g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another
+direction by θ than its mount says moves a pose T by (Ad(T⁻¹) − I) θ. Both stay in the error to the
+end, so they are carried as responses and squared only when asked for (a "consider" covariance):
 
-    Σ = Σ_k + σ_δ² g_k g_kᵀ + σ_θ² M Mᵀ.
+    Σ = Σ_k + Σ_δ σ_δ² g_k g_kᵀ + σ_θ² M Mᵀ.
 
 Reference: Schmidt, "Application of state-space methods to navigation problems", 1966; Barfoot,
 Furgale, "Associating Uncertainty With Three-Dimensional Poses", T-RO 2014.
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.bundle import BundleSolution
+from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.vision.stereo import StereoNoise
 
@@ -41,11 +42,12 @@ class Drift:
 
     Attributes:
         covariance: (6, 6) due to noise, right tangent.
-        response: (6,) motion of the pose per unit of disparity offset over focal length.
+        responses: (3, 6) motion of the pose per unit of disparity error over focal length: an
+            offset, a slope in x, a slope in y of the normalised image.
     """
 
     covariance: Array
-    response: Array
+    responses: Array
 
     def onwards(
         self, T_newest_anchor: Array, solution: BundleSolution, newest: int, overlap: float
@@ -62,7 +64,7 @@ class Drift:
         factor = overlap * solution.variance_factor
         return Drift(
             Ad @ self.covariance @ Ad.T + factor * solution.covariances[newest],
-            Ad @ self.response + solution.disparity_response[newest],
+            self.responses @ Ad.T + solution.disparity_responses[newest],
         )
 
 
@@ -71,25 +73,25 @@ class Calibration:
     """How far the calibration may be off, as standard deviations.
 
     Attributes:
-        disparity: of one offset in all disparities, over focal length.
+        disparity: (3,) of disparities over focal length: offset, slopes in x and y.
         direction: of the camera's direction about each axis, radians.
         Ad_body_camera: (6, 6) adjoint of the camera's mount.
     """
 
-    disparity: float
+    disparity: Array
     direction: float
     Ad_body_camera: Array
 
     @staticmethod
-    def of(noise: StereoNoise, focal: float, T_body_camera: Array) -> "Calibration":
-        """Take the standard deviations of a configuration."""
-        sigma = noise.calibration_px / focal
-        return Calibration(sigma, sigma, se3_adjoint(T_body_camera))
+    def of(noise: StereoNoise, camera: Camera, T_body_camera: Array) -> "Calibration":
+        """Take the deviations of a configuration; slopes reach theirs at the image's rim."""
+        sigma, rim = noise.calibration_px / camera.fx, 0.5 * camera.width / camera.fx
+        return Calibration(sigma / np.array([1.0, rim, rim]), sigma, se3_adjoint(T_body_camera))
 
     def total(self, drift: Drift, T_world_body: Array) -> Array:
         """Return the (6, 6) covariance of a pose, calibration included."""
         mount = (se3_adjoint(se3_inverse(T_world_body)) - np.eye(6)) @ self.Ad_body_camera[:, 3:]
-        offset = self.disparity * drift.response
+        errors = self.disparity[:, None] * drift.responses
         return np.asarray(
-            drift.covariance + np.outer(offset, offset) + self.direction**2 * mount @ mount.T
+            drift.covariance + errors.T @ errors + self.direction**2 * mount @ mount.T
         )

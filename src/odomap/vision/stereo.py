@@ -58,10 +58,10 @@ class StereoNoise:
     """Of a tracked point's position."""
     disparity_px: float = 0.8
     """Of a stereo match's disparity."""
-    overlap: float = 3.5
+    overlap: float = 4.0
     """Factor on variances for errors that observations share: patches overlap, tracks go on."""
-    calibration_px: float = 0.1
-    """Of the calibration: one offset in all disparities, and the direction of the camera."""
+    calibration_px: float = 0.15
+    """Of the calibration: of disparities (offset, slopes), and of the camera's direction."""
 
 
 def match_sparse(
