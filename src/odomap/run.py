@@ -11,18 +11,16 @@ raised again as `Interrupted` with the result inside. The same recording gives t
 trajectory.tum, byte for byte: nothing on the way to it reads a clock.
 """
 
-import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from odomap.errors import CalibrationError, ConfigError, InputError
+from odomap.errors import CalibrationError, InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.logbook import Logbook, skipped_numbers, versions
 from odomap.maps.estimate import Estimate
@@ -34,7 +32,7 @@ if TYPE_CHECKING:
     from odomap.sensors.rig import Rig
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.odometry import Result
+    from odomap.system.odometry import Result, StereoVO
 
 __all__ = ["Interrupted", "Progress", "RunResult", "chosen_config", "run"]
 
@@ -136,9 +134,9 @@ def run(
     """
     from odomap.outputs import Outputs
     from odomap.sources.source import Source
+    from odomap.system.worker import check_rhythm, deferred_interrupt
 
-    if rhythm != "inline":
-        raise ConfigError(f"rhythm '{rhythm}' does not exist in this version: use 'inline'")
+    check_rhythm(rhythm)
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
     settings = chosen_config(preset, config)
@@ -150,9 +148,10 @@ def run(
     tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
     logbook = Logbook(min(len(source), max_frames or len(source)))
-    with _deferred_interrupt() as interrupt:
+    with deferred_interrupt() as interrupt:
         try:
-            result = _track(source, settings, logbook, outputs, max_frames, tell, interrupt)
+            system = _system(source, settings, rhythm)
+            result = _track(source, system, logbook, outputs, max_frames, tell, interrupt)
         except CalibrationError as error:  # found while tracking: say of which recording
             raise CalibrationError(f"{head['data']}: {error}") from error
         state = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
@@ -212,9 +211,15 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
     return time.perf_counter() - start
 
 
+def _system(source: "Source", settings: "Config", rhythm: str) -> "StereoVO":
+    from odomap.system.odometry import StereoVO
+
+    return StereoVO(source.rig, settings, rhythm)
+
+
 def _track(
     source: "Source",
-    settings: "Config",
+    system: "StereoVO",
     logbook: Logbook,
     outputs: "Outputs | None",
     max_frames: int | None,
@@ -222,13 +227,10 @@ def _track(
     interrupt: threading.Event,
 ) -> "Result":
     """Track frame after frame until the source, the limit or the user ends it."""
-    from odomap.system.odometry import StereoVO
-
-    system = StereoVO(source.rig, settings)
     total = min(len(source), max_frames or len(source))
     for frame in source:
         start = time.perf_counter()
-        estimate = system.track(frame)
+        estimate = system.worker.advance(frame)
         logbook.add(frame, estimate, time.perf_counter() - start)
         if outputs is not None:
             outputs.append(estimate)
@@ -264,26 +266,6 @@ def _concluded(
         failure=metrics["failure"],
         warnings=tuple(warnings),
     )
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into an event, so that no frame is torn; a second one interrupts."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def on_interrupt(number: int, frame: FrameType | None) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _metrics(

@@ -37,6 +37,7 @@ __all__ = [
     "InlineWorker",
     "ObserverFailure",
     "Worker",
+    "check_rhythm",
     "deferred_interrupt",
     "make_worker",
 ]
@@ -188,6 +189,19 @@ RHYTHMS: Mapping[str, Callable[[Stages], Worker]] = MappingProxyType({"inline": 
 """The rhythms there are, by name."""
 
 
+def check_rhythm(rhythm: str) -> None:
+    """Raise unless there is such a rhythm.
+
+    Raises:
+        ConfigError: it names those there are.
+    """
+    if rhythm not in RHYTHMS:
+        known = ", ".join(RHYTHMS)
+        why = "is not in this version" if rhythm in _LATER else "is unknown"
+        near = "" if rhythm in _LATER else nearest_name(rhythm, RHYTHMS)
+        raise ConfigError(f"rhythm: '{rhythm}' {why}{near}; use one of: {known}")
+
+
 def make_worker(rhythm: str, stages: Stages) -> Worker:
     """Return a worker of the rhythm asked for.
 
@@ -198,11 +212,7 @@ def make_worker(rhythm: str, stages: Stages) -> Worker:
     Raises:
         ConfigError: if this version has no such rhythm.
     """
-    if rhythm not in RHYTHMS:
-        known = ", ".join(RHYTHMS)
-        why = "is not in this version" if rhythm in _LATER else "is unknown"
-        near = nearest_name(rhythm, RHYTHMS)
-        raise ConfigError(f"rhythm: '{rhythm}' {why}{near}; use one of: {known}")
+    check_rhythm(rhythm)
     return RHYTHMS[rhythm](stages)
 
 
