@@ -82,7 +82,9 @@ class Row:
 
 def main() -> int:
     options = _options()
-    assignments = tuple(tuple(text.split("=", 1)) for text in options.set)
+    assignments = tuple(
+        (name, value) for name, _, value in (text.partition("=") for text in options.set)
+    )
     jobs = [
         Job(kind, seed, options.frames, tuple(options.world), options.cache, assignments)
         for kind in options.kinds

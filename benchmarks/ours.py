@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 from meter import Meter
 
+from odomap.errors import OdomapError
 from odomap.files.trajectories import write_tum
 from odomap.kernels import modules_with_kernels, warm_up
 from odomap.maps.estimate import Status
@@ -23,6 +24,13 @@ from odomap.system.odometry import StereoVO
 
 
 def main() -> None:
+    try:
+        play(_options())
+    except OdomapError as error:
+        sys.exit(str(error))
+
+
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data")
     parser.add_argument("prefix")
@@ -30,11 +38,17 @@ def main() -> None:
     parser.add_argument("--cv-threads", type=int, default=0)
     parser.add_argument("--fast", action="store_true", help="do not wait for the sensor")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def play(options: argparse.Namespace) -> None:
+    """Track every frame when it is due, and write what came of it."""
     if options.cv_threads:
         cv2.setNumThreads(options.cv_threads)
     source = open_source(options.data)
-    assignments = [tuple(text.split("=", 1)) for text in options.set]
+    assignments = [
+        (name, value) for name, _, value in (text.partition("=") for text in options.set)
+    ]
     system = StereoVO(source.rig, chosen_config(None, None, assignments))
     imported = set(sys.modules)
     for name in modules_with_kernels():
