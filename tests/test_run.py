@@ -178,7 +178,7 @@ def test_config_changes_the_run(world, tmp_path):
 
 
 def test_refusals(world, tmp_path):
-    with pytest.raises(ConfigError, match="rhythm: 'live' is not in this version; use one of: inline"):
+    with pytest.raises(ConfigError, match="'live' is not in this version; use one of: inline"):
         run(world, rhythm="live")
     with pytest.raises(ConfigError, match="did you mean 'stereo'"):
         run(world, preset="streo")

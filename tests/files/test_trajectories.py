@@ -101,11 +101,12 @@ def test_order_of_the_quaternion(tmp_path: Path) -> None:
         np.testing.assert_allclose(trajectory.Ts_world_body[0], expected, atol=1e-15)
 
 
-def test_rows_are_sorted_and_repeated_ones_dropped(tmp_path: Path) -> None:
+def test_rows_are_sorted_and_none_is_lost(tmp_path: Path) -> None:
     rows = ["2 2 0 0 0 0 0 1", "1 1 0 0 0 0 0 1 # a comment", "", "# more", "2 9 0 0 0 0 0 1"]
     (tmp_path / "a.tum").write_text("\n".join(rows))
     trajectory = read_tum(tmp_path / "a.tum")
-    assert trajectory.positions[:, 0].tolist() == [1.0, 2.0]
+    assert trajectory.positions[:, 0].tolist() == [1.0, 2.0, 9.0]
+    assert trajectory.stamps_ns.tolist() == [10**9, 2 * 10**9, 2 * 10**9 + 1]
 
 
 def test_commas_and_byte_order_mark_are_fine(tmp_path: Path) -> None:

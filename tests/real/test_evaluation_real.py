@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from odomap.errors import InputError
 from odomap.evaluation.metrics import ate, kitti_segments, read_relations, relations, rpe
 from odomap.files.trajectories import read_tum
 from odomap.geometry.lie import quaternion_from_rotation
-from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 
 ALIGNMENTS = ["se3", "sim3", "yaw", "first", "none"]
@@ -58,7 +56,7 @@ def pair(
     paths = folder / "truth.txt", folder / "estimate.txt"
     for path, text in zip(paths, texts):
         path.write_text(text)
-    return Pair(_every_row(paths[1]), _every_row(paths[0]), paths)
+    return Pair(read_tum(paths[1]), read_tum(paths[0]), paths)
 
 
 def _tum_of_kitti(rows: np.ndarray, times: np.ndarray) -> str:
@@ -69,17 +67,6 @@ def _tum_of_kitti(rows: np.ndarray, times: np.ndarray) -> str:
     assert len(times) == len(lines)
     rows = zip(times, lines.tolist())
     return "".join(f"{t:.7f} {' '.join(map(repr, numbers))}\n" for t, numbers in rows)
-
-
-def _every_row(path: Path) -> Trajectory:
-    """Read TUM text; a repeated stamp moves on by a nanosecond, since the script counts its row."""
-    rows = [line.split() for line in path.read_text().splitlines() if line and line[0] != "#"]
-    stamps = np.array([int(Decimal(row[0]).scaleb(9)) for row in rows])
-    numbers = np.array([row[1:8] for row in rows], dtype=float)
-    while (again := np.flatnonzero(np.diff(stamps) == 0)).size:
-        stamps[again + 1] += 1
-    poses = [SE3.from_quaternion(v[[6, 3, 4, 5]], v[:3]) for v in numbers]
-    return Trajectory.of_poses(stamps, poses)
 
 
 def _score(script: Path, *arguments: object) -> dict[str, float]:

@@ -9,7 +9,7 @@ Three layouts of the same thing, one pose T_world_body per row:
 Quaternions are w x y z in memory and are reordered here and nowhere else. A stamp goes from its
 decimal text to integer nanoseconds and back without a float between, so what was written
 associates with its images exactly. The same trajectory gives the same bytes, gzipped or not.
-Reading accepts gzip, rows out of order (sorted) and repeated stamps (the first stays); a broken
+Reading accepts gzip, rows out of order (sorted) and repeated stamps (1 ns later each); a broken
 row is an error that names its line.
 
 Reference: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012;
@@ -29,7 +29,7 @@ from odomap.files.atomic import write_bytes
 from odomap.files.text import Table, read_lines, read_table
 from odomap.geometry.lie import orthonormalize, quaternion_from_rotation, rotation_from_quaternion
 from odomap.geometry.trajectory import Trajectory
-from odomap.sensors.sync import format_stamp, order_stamps, read_stamps
+from odomap.sensors.sync import format_stamp, read_stamps
 
 __all__ = [
     "read_euroc",
@@ -226,8 +226,11 @@ def _stamped(file: Path, table: Table, rows: NDArray[np.float64], unit: str) -> 
 
 
 def _ordered(stamps_ns: NDArray[np.int64], Ts: NDArray[np.float64]) -> Trajectory:
-    order = order_stamps(stamps_ns).order
-    return Trajectory(stamps_ns[order], Ts[order])
+    """Sort by time; a repeated stamp moves on by a nanosecond: no pose of a file is lost."""
+    order = np.argsort(stamps_ns, kind="stable")
+    stamps = stamps_ns[order] - np.arange(len(order))
+    stamps = np.maximum.accumulate(stamps) + np.arange(len(order))
+    return Trajectory(stamps, Ts[order])
 
 
 def _need_rows(file: Path, table: Table) -> None:
