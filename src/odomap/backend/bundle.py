@@ -244,9 +244,25 @@ def _retract(poses: PoseArrays, step: Array, R_new: Array, t_new: Array) -> None
     for i in range(len(poses.R)):
         f = 6 * poses.column[i]
         if f < 0:
-            R_new[i], t_new[i] = poses.R[i], poses.t[i]
+            for a in range(3):
+                t_new[i, a] = poses.t[i, a]
+                for b in range(3):
+                    R_new[i, a, b] = poses.R[i, a, b]
         else:
             se3_retract(poses.R[i], poses.t[i], step[f : f + 6], R_new[i], t_new[i])
+
+
+@kernel
+def _take_step(poses: PoseArrays, points: Array, trial: PoseArrays, moved: Array) -> None:
+    """Copy a step that was tried; in loops, since whole arrays take seconds to compile."""
+    for i in range(len(poses.R)):
+        for a in range(3):
+            poses.t[i, a] = trial.t[i, a]
+            for b in range(3):
+                poses.R[i, a, b] = trial.R[i, a, b]
+    for m in range(len(points)):
+        for a in range(3):
+            points[m, a] = moved[m, a]
 
 
 @kernel
@@ -282,13 +298,14 @@ def _solve_kernel(
         reduced_system(poses, points, cameras, seen, width, damping, system)
         trial = np.inf
         if factor(system.S):
-            system.s[:] = -system.s
+            for a in range(size):
+                system.s[a] = -system.s[a]
             solve(system.S, system.s)
             _retract(poses, system.s, trial_poses.R, trial_poses.t)
             back_substitute(poses, seen, system, points, moved)
             trial = robust_cost(trial_poses, moved, cameras, seen, width, chi2)
         if trial < cost:
-            poses.R[:], poses.t[:], points[:] = trial_poses.R, trial_poses.t, moved
+            _take_step(poses, points, trial_poses, moved)
             small = cost - trial < tolerance * cost
             cost, damping, grow = trial, max(0.2 * damping, 1e-9), 4.0
             if small:
@@ -305,7 +322,8 @@ def _solve_kernel(
         invert(system.S, joint)
         disparity_response(poses, points, cameras, seen, width, system, response)
         for e in range(3):
-            response[e] = -response[e]
+            for a in range(size):
+                response[e, a] = -response[e, a]
             solve(system.S, response[e])
     else:
         reason = 3

@@ -160,8 +160,14 @@ def _solve_kernel(
                 return False
             solve(H, b)
             se3_retract(R, t, b, R_new, t_new)
-            R[:], t[:] = R_new, t_new
-            size = np.sqrt(np.sum(b * b))
+            for a in range(3):
+                t[a] = t_new[a]
+                for c in range(3):
+                    R[a, c] = R_new[a, c]
+            size = 0.0
+            for a in range(6):
+                size += b[a] * b[a]
+            size = np.sqrt(size)
             if not np.isfinite(size):
                 return False
             if size < 1e-6:

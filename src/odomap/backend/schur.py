@@ -255,7 +255,7 @@ def back_substitute(
     """Write the moved landmarks p − C⁻¹ (c + Wᵀ δξ), where `system.s` holds δξ (6F,)."""
     b, C = np.empty(3), system.C_inverse
     for m in range(len(points)):
-        b[:] = system.c[m]
+        b[0], b[1], b[2] = system.c[m, 0], system.c[m, 1], system.c[m, 2]
         for o in range(seen.start[m], seen.start[m + 1]):
             f = 6 * poses.column[seen.pose[o]]
             if f < 0:
