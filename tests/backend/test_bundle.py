@@ -167,6 +167,32 @@ def test_the_variance_factor_shows_wrong_weights():
     assert solve_bundle(few).variance_factor == 1.0  # nothing to judge by
 
 
+def test_the_response_to_errors_of_all_disparities_is_how_the_poses_move():
+    """An offset and two slopes, solved anew with each, against the derivative."""
+    scene = make_scene(poses=4, points=60, seed=12)
+    bundle = scene.bundle()  # without residuals the normal equations are the whole curvature
+    bundle.disparity[::5] = np.nan
+    config = BundleConfig(iterations=60, tolerance=1e-14, huber_width=1e6)
+    solution = solve_bundle(bundle, config)
+    assert solution.disparity_responses.shape == (4, 3, 6)
+    assert not solution.disparity_responses[0].any()  # held fixed
+    step = 1e-4
+    shapes = (np.ones(len(bundle.xy)), bundle.xy[:, 0], bundle.xy[:, 1])
+    for e, shape in enumerate(shapes):
+        moved = [
+            solve_bundle(
+                replace(bundle, disparity=bundle.disparity + sign * step * shape), config
+            ).Ts_world_body
+            for sign in (1, -1)
+        ]
+        difference = se3_log(se3_inverse(moved[1]) @ moved[0]) / (2 * step)
+        np.testing.assert_allclose(
+            solution.disparity_responses[:, e],
+            difference,
+            atol=0.003 * np.abs(difference).max(),
+        )
+
+
 def test_landmarks_seen_once_say_nothing_about_poses():
     """Without disparity their depth is free: the poses are as sure as without them, no surer."""
     scene = make_scene(poses=4, points=40, seed=8)

@@ -7,6 +7,8 @@ whole range for new ones. New points with a disparity become landmarks.
 Reference: Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017, section III-A.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ from odomap.vision.features import Features
 from odomap.vision.rectifier import Rectifier
 from odomap.vision.stereo import match_sparse, sgbm_disparity
 
-__all__ = ["StereoKeyframes"]
+__all__ = ["Seen", "StereoKeyframes"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,6 +30,25 @@ Image = NDArray[np.uint8]
 
 MIN_DISPARITY_PX = 0.05
 """Below this a point is at infinity as far as the pair can tell, and has no depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a view that may become a keyframe shows.
+
+    Attributes:
+        features: of the n points tracked into it, then of new ones, which all have depth.
+        landmark_ids: (n,) of the tracked points.
+        pixels: (n, 2) where they are.
+        first: (n,) keyframe each was first seen in, −1 for here.
+        first_at: (n, 2) where in its image.
+    """
+
+    features: Features
+    landmark_ids: Index
+    pixels: Array
+    first: Index
+    first_at: Array
 
 
 class StereoKeyframes:
@@ -46,7 +67,7 @@ class StereoKeyframes:
             config.window.size + config.window.fixed,
         )
 
-    def make(
+    def measure(
         self,
         view: View,
         right: Image,
@@ -54,9 +75,8 @@ class StereoKeyframes:
         tracked: Reference | None,
         rows: Index,
         pixels: Array,
-        covariance: Array,
-    ) -> Reference:
-        """Add a keyframe with its landmarks and observations to the map.
+    ) -> Seen:
+        """Find the points and depths of a view, without touching the map.
 
         Args:
             view: the left image.
@@ -65,26 +85,40 @@ class StereoKeyframes:
             tracked: the keyframe it was tracked from, None for the first.
             rows: (n,) rows of that keyframe found in the view.
             pixels: (n, 2) where.
+        """
+        ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
+        pixels, first, first_at = self._first(view, T_world_body, tracked, rows, pixels)
+        expected = self._expected_disparity(T_world_body, ids)
+        return Seen(self._features(view, right, pixels, expected), ids, pixels, first, first_at)
+
+    def add(
+        self, view: View, T_world_body: Array, seen: Seen, parent: int, covariance: Array
+    ) -> Reference:
+        """Add a keyframe with its landmarks and observations to the map.
+
+        Args:
+            view: the left image.
+            T_world_body: (4, 4).
+            seen: what was measured in it.
+            parent: the keyframe it was tracked from, −1 for the first.
             covariance: (6, 6) of the pose.
 
         Returns:
             The keyframe as the tracker needs it.
         """
-        ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
-        pixels, first, first_at = self._first(view, T_world_body, tracked, rows, pixels)
-        features = self._features(view, right, pixels, self._expected_disparity(T_world_body, ids))
+        features, pixels, first = seen.features, seen.pixels, seen.first
         keyframe_id, n = self._map.new_keyframe_id(), len(pixels)
         self._map.add_keyframe(
             Keyframe(keyframe_id, view.stamp_ns, features),
             T_world_body,
-            parent=-1 if tracked is None else tracked.keyframe_id,
+            parent=parent,
             covariance=covariance,
         )
         bearings, T = features.bearings[n:], self._rectifier.T_body_camera
         points_camera = bearings / bearings[:, 2:] * features.depth[n:, None]
         new = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
         self._sights.remember(keyframe_id, view)
-        ids = np.concatenate([ids, new])
+        ids = np.concatenate([seen.landmark_ids, new])
         self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
         keypoints = np.concatenate([pixels, features.keypoints[n:].astype(np.float64)])
         return self._reference(
@@ -96,7 +130,7 @@ class StereoKeyframes:
             np.concatenate(
                 [np.where(first < 0, keyframe_id, first), np.full(len(new), keyframe_id)]
             ),
-            np.concatenate([first_at, keypoints[n:]]),
+            np.concatenate([seen.first_at, keypoints[n:]]),
         )
 
     def refreshed(self, reference: Reference) -> Reference:

@@ -97,9 +97,10 @@ class WindowMapper:
         newest = change.newest_id
         with map.lock:
             map.apply(change.update)
-            self._drifts[newest] = change.drift
-            covariance = self._calibration.total(change.drift, map.T_world_body(newest))
-            map.set_covariance([newest], covariance)
+            if change.solution.joint_covariance.any():  # else the tracker's word stands
+                self._drifts[newest] = change.drift
+                covariance = self._calibration.total(change.drift, map.T_world_body(newest))
+                map.set_covariance([newest], covariance)
             map.retire_keyframes(change.leaving)
             for keyframe_id in change.leaving:
                 self._drifts.pop(keyframe_id, None)

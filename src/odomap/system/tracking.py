@@ -119,17 +119,18 @@ class StereoTracker:
         frame = pair.frame
         if pair.right is None:
             return self._lose(frame, "the right image is missing: cannot start", pair.clock)
-        none, covariance = np.empty(0, np.int64), self._gap_covariance(frame.stamp_ns)
-        made = self._keyframes.make(
-            pair.view, pair.right, self.path.last_pose(), None, none, np.empty((0, 2)), covariance
+        T_world_body, covariance = self.path.last_pose(), self._gap_covariance(frame.stamp_ns)
+        none = np.empty(0, np.int64)
+        self._keyframes.check_order(pair.view, pair.right)
+        seen = self._keyframes.measure(
+            pair.view, pair.right, T_world_body, None, none, np.empty((0, 2))
         )
+        count, needed = len(seen.features), 2 * self._config.tracking.min_inliers
         pair.clock.lap("keyframe")
-        count, needed = len(made.landmark_ids), 2 * self._config.tracking.min_inliers
         if count < needed:
-            self._keyframes.check_order(pair.view, pair.right)
-            self._map.retire_keyframes([made.keyframe_id])
             why = f"{count} points with depth of {needed} needed to start"
             return self._lose(frame, f"{why}: too dark or no texture?", pair.clock)
+        made = self._keyframes.add(pair.view, T_world_body, seen, -1, covariance)
         anew = len(self.path) > 0
         self._reference, self._since_keyframe, self._lost = made, 0, 0
         self._first_count, self._epoch = count, self._map.epoch
@@ -265,15 +266,17 @@ class StereoTracker:
         self, pair: _Pair, right: Image, reference: Reference, located: Located, placed: Placed
     ) -> Placed:
         """Make the frame a keyframe; the mapper will know its pose better."""
-        rows = located.rows[located.inliers]
-        self._reference = self._keyframes.make(
+        T_world_body, inliers = located.T_world_body, located.inliers
+        seen = self._keyframes.measure(
             pair.view,
             right,
-            located.T_world_body,
+            T_world_body,
             reference,
-            rows,
-            located.pixels[located.inliers],
-            self.path.covariance(placed),
+            located.rows[inliers],
+            located.pixels[inliers],
+        )
+        self._reference = self._keyframes.add(
+            pair.view, T_world_body, seen, reference.keyframe_id, self.path.covariance(placed)
         )
         self._since_keyframe = 0
         pair.clock.lap("keyframe")
