@@ -155,6 +155,15 @@ def test_observers_are_told(room):
     assert vo.worker.failures == []
 
 
+def test_motion_is_predicted(room):
+    """Flow without a pyramid reaches two pixels: only the prediction brings it near enough."""
+    config = preset("stereo")
+    config = replace(config, flow=replace(config.flow, levels=1))
+    estimates, result, _ = run(room, config)
+    assert [e.status for e in estimates].count(Status.TRACKING) >= 46
+    assert ate(result.trajectory, room.truth).rmse < 0.03
+
+
 def test_the_path_may_be_read_in_the_middle(room, done):
     vo = StereoVO(room.rig)
     for frame in room.part(0, 20):
