@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from odomap.vision.flow import (
-    FlowConfig,
-    _sample_template,
-    align_patches,
-    facing_warp,
-    pyramid,
-    track,
-)
+from odomap.vision.flow import FlowConfig, facing_warp, pyramid, track
+from odomap.vision.patches import _sample_template, align_patches
 
 SHAPE = (180, 220)
 CONFIG = FlowConfig()

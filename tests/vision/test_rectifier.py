@@ -6,7 +6,7 @@ import pytest
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import CameraMount, Rig
-from odomap.vision.flow import align_patches
+from odomap.vision.patches import align_patches
 from odomap.vision.rectifier import Rectifier
 from odomap.vision.stereo import StereoConfig, match_sparse
 

@@ -49,7 +49,7 @@ class BundleConfig:
     """Most Levenberg-Marquardt steps tried."""
     huber_width: float = 2.5
     """Residual, in standard deviations, beyond which Huber's loss grows linearly."""
-    tolerance: float = 1e-3
+    tolerance: float = 3e-3
     """Relative decrease of the cost below which the solver stops."""
 
 

@@ -19,12 +19,16 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.maps.map import Map
 from odomap.system.association import Reference, View
-from odomap.vision.flow import FlowConfig, align_patches, facing_warp
+from odomap.vision.flow import FlowConfig, facing_warp
+from odomap.vision.patches import align_patches
 
 __all__ = ["FirstSights"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+MAX_DRIFT_PX = 1.5
+"""A point that lies farther from where it was tracked to has been found somewhere else."""
 
 
 class FirstSights:
@@ -66,28 +70,27 @@ class FirstSights:
         Returns:
             (n, 2) pixels, and (n,) whether each still goes back to its first sight.
         """
-        aligned, kept = np.array(pixels), np.zeros(len(rows), np.bool_)
         points = self._map.points_world(reference.landmark_ids[rows])
-        T_camera_world = se3_inverse(T_world_body @ self._T_body_camera)
-        points_camera = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-        for keyframe_id in np.unique(reference.first_keyframe[rows]).tolist():
-            first = self._views.get(keyframe_id)
+        T_world_camera = T_world_body @ self._T_body_camera
+        points_camera = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        keyframes, which = np.unique(reference.first_keyframe[rows], return_inverse=True)
+        Ts_world_first = self._map.Ts_world_body(keyframes) @ self._T_body_camera
+        warp = facing_warp(points_camera, (se3_inverse(Ts_world_first) @ T_world_camera)[which])
+        aligned, correlation = np.array(pixels), np.zeros(len(rows))
+        for k, keyframe_id in enumerate(keyframes.tolist()):
+            first, of = self._views.get(keyframe_id), np.flatnonzero(which == k)
             if first is None:
                 continue
-            of = np.flatnonzero(reference.first_keyframe[rows] == keyframe_id)
-            T_first_world = se3_inverse(self._map.T_world_body(keyframe_id) @ self._T_body_camera)
-            warp = facing_warp(points_camera[of], T_first_world @ se3_inverse(T_camera_world))
             found = align_patches(
                 first.image,
                 view.image,
                 reference.first_keypoint[rows[of]],
                 pixels[of],
-                warp,
+                warp[of],
                 self._flow.half_window_px,
                 self._flow.iterations,
             )
-            moved = np.linalg.norm(found.points - pixels[of], axis=1)
-            good = found.found & (found.correlation >= self._flow.min_correlation) & (moved < 1.5)
-            aligned[of[good]] = found.points[good]
-            kept[of[good]] = True
-        return aligned, kept
+            aligned[of], correlation[of] = found.points, np.where(found.found, found.correlation, 0)
+        near = np.abs(aligned - pixels).max(axis=1, initial=0.0) < MAX_DRIFT_PX
+        kept = near & (correlation >= self._flow.min_correlation)
+        return np.where(kept[:, None], aligned, pixels), kept

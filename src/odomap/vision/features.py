@@ -151,7 +151,7 @@ def _fast(image: Image, threshold: int, wanted: int) -> Corners:
     keypoints: Sequence[cv2.KeyPoint] = ()
     for level in (threshold, max(threshold // 2, 3)):
         keypoints = cv2.FastFeatureDetector.create(level, True).detect(image, None)
-        if len(keypoints) >= 2 * wanted:
+        if len(keypoints) >= wanted:
             break
     if not keypoints:
         return _empty()

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.vision.flow import align_patches
+from odomap.vision.patches import align_patches
 
 __all__ = ["StereoConfig", "StereoNoise", "match_sparse", "sgbm_disparity"]
 
