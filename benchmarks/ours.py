@@ -35,7 +35,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("data")
     parser.add_argument("prefix")
     parser.add_argument("--frames", type=int, default=0)
-    parser.add_argument("--cv-threads", type=int, default=0)
+    parser.add_argument("--cv-threads", type=int, default=0, help="default 1, as in odomap run")
     parser.add_argument("--fast", action="store_true", help="do not wait for the sensor")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     return parser.parse_args()
@@ -43,8 +43,7 @@ def _options() -> argparse.Namespace:
 
 def play(options: argparse.Namespace) -> None:
     """Track every frame when it is due, and write what came of it."""
-    if options.cv_threads:
-        cv2.setNumThreads(options.cv_threads)
+    cv2.setNumThreads(options.cv_threads or 1)
     source = open_source(options.data)
     assignments = [
         (name, value) for name, _, value in (text.partition("=") for text in options.set)

@@ -212,8 +212,12 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
 
 
 def _system(source: "Source", settings: "Config", rhythm: str) -> "StereoVO":
+    import cv2
+
     from odomap.system.odometry import StereoVO
 
+    # The stages use the cores themselves; OpenCV's own threads would only get in their way.
+    cv2.setNumThreads(1)
     return StereoVO(source.rig, settings, rhythm)
 
 
