@@ -119,7 +119,6 @@ def test_stamps_survive_to_the_nanosecond(data_folder: Path, tmp_path: Path, nam
     again = read_tum(tmp_path / "again.tum")
     assert np.array_equal(again.stamps_ns, trajectory.stamps_ns)
     np.testing.assert_allclose(again.Ts_world_body, trajectory.Ts_world_body, atol=5e-9)
-    # Text has microseconds: nothing below may appear.
     # Written to the microsecond at most; one row of the desk's truth repeats a stamp, and moves on.
     assert np.count_nonzero(trajectory.stamps_ns % 100_000 % 1000) <= 1
 
