@@ -42,11 +42,11 @@ class StereoConfig:
     """Half the side of the window in the search along the row."""
     half_refine_px: int = 4
     """Half the side of the patch in the sub-pixel step."""
-    uniqueness: float = 0.85
+    uniqueness: float = 0.75
     """The best score must be below this fraction of the best score elsewhere on the row."""
     min_correlation: float = 0.8
     """Smallest normalised correlation of the two patches."""
-    max_vertical_px: float = 1.0
+    max_vertical_px: float = 0.5
     """Largest distance of a match from its row."""
 
 
