@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 class WindowConfig:
     """The window of keyframes adjusted together."""
 
-    size: int = 8
+    size: int = 7
     """Keyframes adjusted."""
     fixed: int = 2
     """Older keyframes that hold them in place."""

@@ -43,7 +43,7 @@ class FeatureConfig:
 
     detector: Detector = "fast"
     """Corner detector: fast, harris, orb or sift."""
-    count: int = 320
+    count: int = 300
     """Features wanted per keyframe."""
     threshold: int = 12
     """FAST contrast threshold, grey levels; halved once where too few corners pass."""
