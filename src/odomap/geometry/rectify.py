@@ -25,6 +25,7 @@ from odomap.errors import CalibrationError, InputError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.geometry.so3 import Array
+from odomap.geometry.undistort import axis_focal, lowest_focal, view_middle, warp_maps
 
 __all__ = ["Side", "StereoRectification"]
 
@@ -103,14 +104,8 @@ class StereoRectification:
         Returns:
             map_x, map_y: (H, W) float32 pixels; -1 where the lens sees nothing.
         """
-        w, h = self.camera.resolution
-        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
-        raw = self.to_raw(np.stack([u.ravel(), v.ravel()], axis=1), which)
-        raw = np.where(np.isnan(raw), -1.0, raw).astype(np.float32)
-        return (
-            np.ascontiguousarray(raw[:, 0].reshape(h, w)),
-            np.ascontiguousarray(raw[:, 1].reshape(h, w)),
-        )
+        camera, R_camera_rect = self._side(which)
+        return warp_maps(self.camera, camera, R_camera_rect)
 
     def to_raw(self, pixels_rect: ArrayLike, which: Side) -> Array:
         """Map rectified pixels to pixels of the raw image.
@@ -187,23 +182,12 @@ def _common_pinhole(
     left: Camera, right: Camera, R_left_rect: Array, R_right_rect: Array, focal_px: float | None
 ) -> Camera:
     """Return the shared pinhole: the mean focal length, both views centred in the image."""
-    mean = float(np.mean([left.fx, left.fy, right.fx, right.fy]))
-    focal = mean if focal_px is None else float(focal_px)
-    middles = []
-    for camera, R_camera_rect in ((left, R_left_rect), (right, R_right_rect)):
-        rays = camera.unproject(_border(camera)) @ R_camera_rect
-        plane = rays[np.all(np.isfinite(rays), axis=1) & (rays[:, 2] > 0.05)]
-        if len(plane) < 4:
-            raise CalibrationError("distortion: the lens model cannot be inverted at the border")
-        middles.append(np.mean(plane[:, :2] / plane[:, 2:], axis=0))
-    size = np.array(left.resolution, dtype=np.float64)
-    principal = 0.5 * (size - 1.0) - focal * np.mean(middles, axis=0)
+    sides = ((left, R_left_rect), (right, R_right_rect))
+    if focal_px is None:
+        focal = float(np.mean([axis_focal(camera) for camera, _ in sides]))
+        focal = max(focal, float(np.mean([lowest_focal(camera) for camera, _ in sides])))
+    else:
+        focal = float(focal_px)
+    middle = np.mean([view_middle(camera, R) for camera, R in sides], axis=0)
+    principal = 0.5 * (np.array(left.resolution, dtype=np.float64) - 1.0) - focal * middle
     return Camera("pinhole", np.array([focal, focal, *principal]), np.array([]), left.resolution)
-
-
-def _border(camera: Camera) -> Array:
-    """Return pixels all around the image, 32 per side."""
-    s = np.linspace(0.0, 1.0, 32)
-    low, high = np.zeros_like(s), np.ones_like(s)
-    unit = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
-    return unit * (np.array(camera.resolution) - 1.0)
