@@ -1,5 +1,6 @@
 """Real recordings open, and say what their authors say about them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 from odomap.errors import InputError
 from odomap.files.rig import read_rig
 from odomap.files.trajectories import read_trajectory, read_tum, write_tum
+from odomap.sensors.rig import DepthMount
 from odomap.sources.describe import describe
 from odomap.sources.disturb import there_and_back
 from odomap.sources.images import decode, find_mosaic
 from odomap.sources.open import open as open_source
+from odomap.sources.tum import TumSource
 
 
 def test_euroc(data_folder: Path) -> None:
@@ -73,6 +76,37 @@ def test_kitti_mono(data_folder: Path) -> None:
     assert [len(frame.images) for frame in source] == [1] * 100
 
 
+def test_tum(data_folder: Path) -> None:
+    source = open_source(data_folder / "rgbd_desk")
+    assert isinstance(source, TumSource)
+    facts = describe(source)
+    assert (facts["frames"], facts["notes"], facts["skipped"]) == (160, [], [])
+    assert facts["truth"]["frames_covered"] == 160
+    assert facts["truth"]["path_m"] == pytest.approx(0.44, abs=0.01)
+    assert source.depth is not None
+    assert np.abs(source.depth.paired).max() < 20_000_000
+    frame = source.frame(80)
+    assert frame.stamp_ns == source.stamps_ns[80]
+    assert frame.depth is not None
+    assert frame.depth.dtype == np.float32
+    assert frame.depth.shape == frame.images[0].shape == (480, 640)
+    seen = frame.depth[frame.depth > 0]
+    assert 0.6 < np.percentile(seen, 1) < np.percentile(seen, 99) < 5
+    assert 0.15 < np.mean(frame.depth == 0) < 0.4
+    colour = source.colour(80)
+    assert colour.shape == (480, 640, 3)
+    # Luma is 0.299 R + 0.587 G + 0.114 B.
+    grey = colour @ np.array([0.299, 0.587, 0.114])
+    assert np.abs(grey - frame.images[0]).max() <= 1
+
+
+def test_tum_with_the_factor_of_another_camera(data_folder: Path) -> None:
+    rig = read_rig(data_folder / "rgbd_desk")
+    wrong = replace(rig, depth=DepthMount("rgb", 1000.0))
+    (note,) = TumSource(data_folder / "rgbd_desk", wrong).notes
+    assert "with factor 1000: is it 5000" in note
+
+
 def test_no_real_image_is_taken_for_a_mosaic(data_folder: Path) -> None:
     paths = [
         *sorted((data_folder / "euroc_mh01/mav0/cam0/data").iterdir())[::10],
@@ -129,7 +163,7 @@ def test_kitti_rows(data_folder: Path) -> None:
     assert truth.path_length == pytest.approx(3724, abs=1)
 
 
-@pytest.mark.parametrize("name", ["rgbd_desk", "laser2d", "graphs", "truth"])
+@pytest.mark.parametrize("name", ["laser2d", "graphs", "truth"])
 def test_other_recordings_are_explained(data_folder: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"not recognised .* supported are EuRoC"):
         open_source(data_folder / name)

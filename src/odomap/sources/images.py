@@ -34,7 +34,16 @@ from numpy.typing import NDArray
 
 from odomap.errors import InputError
 
-__all__ = ["BadImage", "ImageFormat", "decode", "find_mosaic", "probe_format", "read_image"]
+__all__ = [
+    "BadImage",
+    "ImageFormat",
+    "decode",
+    "find_mosaic",
+    "probe_format",
+    "read_colour",
+    "read_image",
+    "spread",
+]
 
 SAMPLES = 5
 """Images looked at to find out what a camera writes."""
@@ -107,6 +116,30 @@ def read_image(path: Path, form: ImageFormat) -> NDArray[np.uint8]:
     return np.ascontiguousarray(raw, np.uint8)
 
 
+def read_colour(path: Path, form: ImageFormat) -> NDArray[np.uint8]:
+    """Read an image file as colour.
+
+    Args:
+        path: the file.
+        form: what its camera writes.
+
+    Returns:
+        (H, W, 3) uint8 red, green, blue; three times the same where the file is grey or a mosaic,
+        whose layout says where green is, but not which of the others is red.
+
+    Raises:
+        BadImage: it is missing, truncated, not an image, or of another size.
+    """
+    raw = decode(path)
+    if raw.ndim == 2 or (raw.shape[1], raw.shape[0]) != form.resolution:
+        return np.repeat(read_image(path, form)[:, :, None], 3, axis=2)
+    code = cv2.COLOR_BGRA2RGB if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    colour: NDArray[Any] = np.asarray(cv2.cvtColor(raw, code))
+    if colour.dtype == np.uint16:
+        colour = np.minimum(colour >> max(form.bits - 8, 0), 255)
+    return np.ascontiguousarray(colour, np.uint8)
+
+
 def decode(path: Path) -> NDArray[Any]:
     """Decode an image file as it is: (H, W) or (H, W, 3 | 4), uint8 or uint16.
 
@@ -174,7 +207,7 @@ def probe_format(paths: Sequence[Path], where: str) -> ImageFormat:
     """
     images: list[NDArray[Any]] = []
     reason = "no images"
-    for index in _spread(len(paths)):
+    for index in spread(len(paths)):
         try:
             images.append(decode(paths[index]))
             if len(images) == SAMPLES:
@@ -195,10 +228,10 @@ def probe_format(paths: Sequence[Path], where: str) -> ImageFormat:
     return ImageFormat(resolution, max(bits, 8), mosaic, len(flat) < len(images))
 
 
-def _spread(count: int) -> list[int]:
+def spread(count: int, samples: int = SAMPLES) -> list[int]:
     """Return indices spread over a recording, then others between them, should some be broken."""
-    coarse = np.linspace(0, count - 1, min(count, SAMPLES)).astype(int).tolist()
-    fine = np.linspace(0, count - 1, min(count, 4 * SAMPLES)).astype(int).tolist()
+    coarse = np.linspace(0, count - 1, min(count, samples)).astype(int).tolist()
+    fine = np.linspace(0, count - 1, min(count, 4 * samples)).astype(int).tolist()
     return list(dict.fromkeys(coarse + fine))
 
 

@@ -4,6 +4,7 @@ Recognised by what a folder holds, not by its name:
 
     EuRoC ASL         mav0/cam0/data.csv (or the inside of mav0)
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
+    TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
 A path that leads nowhere is answered with what stands nearest to it.
@@ -17,11 +18,13 @@ from odomap.sensors.rig import Rig
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.kitti import KittiSource, is_kitti
 from odomap.sources.source import Source
+from odomap.sources.tum import TumSource, is_tum
 
 __all__ = ["SUPPORTED", "open"]
 
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
+    "TUM RGB-D (rgb.txt, depth.txt), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
 
@@ -61,7 +64,8 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
         raise InputError(f"{root}: files of this kind cannot be opened; supported are {SUPPORTED}")
     if (root / "world.yaml").exists():
         return _simulated(str(root / "world.yaml"), rig)
-    for recognises, reader in ((is_euroc, EurocSource), (is_kitti, KittiSource)):
+    readers = ((is_euroc, EurocSource), (is_kitti, KittiSource), (is_tum, TumSource))
+    for recognises, reader in readers:
         if recognises(root):
             return reader(root, _rig(root, rig))
     raise InputError(_unrecognised(root))

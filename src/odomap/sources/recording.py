@@ -1,8 +1,8 @@
 """Recordings: folders of images with stamps, read one frame at a time.
 
-What EuRoC and KITTI recordings share: for every frame a stamp and one image file per camera,
-beside it inertial samples and ground truth. Opening reads the listings (about 0.1 kB per frame)
-and a few images; iterating reads one frame, hands it out, and keeps nothing.
+What recordings made of image files share: for every frame a stamp and one image file per camera,
+beside it depth, inertial samples and ground truth. Opening reads the listings (about 0.1 kB per
+frame) and a few images; iterating reads one frame, hands it out, and keeps nothing.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,9 @@ from odomap.errors import CalibrationError, InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame, ImuSamples
 from odomap.sensors.rig import CameraMount, Rig
-from odomap.sources.images import BadImage, ImageFormat, probe_format, read_image
+from odomap.sources.calibration import check_resolution
+from odomap.sources.depth import DepthFiles, read_depth
+from odomap.sources.images import BadImage, ImageFormat, probe_format, read_colour, read_image
 from odomap.sources.source import Skipped, UnusableFrame
 
 __all__ = ["CameraFiles", "Recording", "check_stereo", "check_truth", "open_cameras"]
@@ -39,13 +41,14 @@ class CameraFiles:
 
 @dataclass(eq=False, repr=False)
 class Recording:
-    """A source made of image files; a `RandomAccess`.
+    """A source made of image files; a `RandomAccess`, and `Coloured`.
 
     Attributes:
         name: short name.
         rig: what is mounted where; one camera per entry of `cameras`.
         stamps_ns: (N,) int64, strictly increasing.
         cameras: the image files.
+        depth: the depth images, if recorded.
         imu: all inertial samples, if recorded (56 bytes each).
         truth: T_world_body, if known.
         left_out: what the listings had to leave out.
@@ -57,6 +60,7 @@ class Recording:
     rig: Rig
     stamps_ns: NDArray[np.int64]
     cameras: tuple[CameraFiles, ...]
+    depth: DepthFiles | None = None
     imu: ImuSamples | None = None
     truth: Trajectory | None = None
     left_out: list[Skipped] = field(default_factory=list)
@@ -79,18 +83,18 @@ class Recording:
         Raises:
             InputError: after the last one, if none could be.
         """
-        self.skipped = skipped = list(self.left_out)
+        self.skipped = list(self.left_out)
         last_ns: int | None = None
         for index in range(len(self)):
             try:
                 frame = self._read(index, last_ns)
             except UnusableFrame as error:
-                skipped.append(error.skipped)
+                self.skipped.append(error.skipped)
                 continue
             yield frame
             last_ns = frame.stamp_ns
         if last_ns is None:
-            first = skipped[-1]
+            first = self.skipped[-1]
             raise InputError(f"{first.file}: {first.reason}; no frame of {self.name} can be read")
 
     def frame(self, index: int) -> Frame:
@@ -103,23 +107,60 @@ class Recording:
             UnusableFrame: it cannot be read.
             IndexError: there is no such frame.
         """
+        self._check(index)
+        return self._read(index, int(self.stamps_ns[index - 1]) if index else None)
+
+    def colour(self, index: int) -> NDArray[np.uint8]:
+        """Read the image of the first camera in colour: (H, W, 3) uint8 red, green, blue.
+
+        Args:
+            index: from 0 to len - 1.
+
+        Raises:
+            UnusableFrame: it cannot be read.
+            IndexError: there is no such frame.
+        """
+        self._check(index)
+        camera = self.cameras[0]
+        path = camera.folder / camera.names[index]
+        try:
+            return read_colour(path, camera.form)
+        except BadImage as error:
+            raise UnusableFrame(self._skipped(index, path, error)) from error
+
+    def _check(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
-        return self._read(index, int(self.stamps_ns[index - 1]) if index else None)
 
     def _read(self, index: int, last_ns: int | None) -> Frame:
         stamp_ns = int(self.stamps_ns[index])
         images = tuple(self._image(camera, index) for camera in self.cameras)
         imu = None if self.imu is None else self.imu.between(last_ns, stamp_ns)
-        return Frame(index, stamp_ns, images, imu=imu)
+        return Frame(index, stamp_ns, images, depth=self._depth(index), imu=imu)
 
     def _image(self, camera: CameraFiles, index: int) -> NDArray[np.uint8]:
         path = camera.folder / camera.names[index]
         try:
             return read_image(path, camera.form)
         except BadImage as error:
-            skipped = Skipped(int(self.stamps_ns[index]), str(path), str(error))
-            raise UnusableFrame(skipped) from error
+            raise UnusableFrame(self._skipped(index, path, error)) from error
+
+    def _depth(self, index: int) -> NDArray[np.float32] | None:
+        """Read the depth of a frame; one that is broken costs the depth, not the frame."""
+        name = None if self.depth is None else self.depth.names[index]
+        if self.depth is None or name is None:
+            return None
+        path = self.depth.folder / name
+        try:
+            return read_depth(path, self.depth.mount, self.depth.resolution)
+        except BadImage as error:
+            skipped = self._skipped(index, path, error, ": the frame has no depth")
+            if skipped not in self.skipped:
+                self.skipped.append(skipped)
+            return None
+
+    def _skipped(self, index: int, path: Path, error: BadImage, effect: str = "") -> Skipped:
+        return Skipped(int(self.stamps_ns[index]), str(path), f"{error}{effect}")
 
 
 def open_cameras(
@@ -143,14 +184,8 @@ def open_cameras(
     cameras = []
     for folder, files, mount in zip(folders, names, mounts, strict=True):
         form = probe_format([folder / name for name in files], str(folder))
-        if mount is not None and form.resolution != mount.camera.resolution:
-            images, rig = (
-                "{}x{}".format(*size) for size in (form.resolution, mount.camera.resolution)
-            )
-            raise CalibrationError(
-                f"{folder}: images are {images}, but camera '{mount.name}' is calibrated "
-                f"for {rig}: {mend}"
-            )
+        if mount is not None:
+            check_resolution(folder, form.resolution, mount, mend)
         cameras.append(CameraFiles(folder, files, form))
     sizes = {camera.form.resolution for camera in cameras}
     if len(sizes) > 1:

@@ -17,7 +17,7 @@ from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 
-__all__ = ["RandomAccess", "Skipped", "Source", "UnusableFrame"]
+__all__ = ["Coloured", "RandomAccess", "Skipped", "Source", "UnusableFrame"]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Source(Protocol):
     skipped: list[Skipped]
 
     def __len__(self) -> int:
-        """Return how many frames there are to expect."""
+        """Return how many frames there are to expect; 0 when unknown (a live camera)."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
@@ -83,6 +83,25 @@ class RandomAccess(Source, Protocol):
 
         Returns:
             The frame; its inertial samples are those since the frame before it.
+
+        Raises:
+            UnusableFrame: it cannot be read.
+        """
+        ...
+
+
+@runtime_checkable
+class Coloured(Protocol):
+    """A source that knows the colour behind its grey images."""
+
+    def colour(self, index: int) -> NDArray[np.uint8]:
+        """Read the colour image of a frame's first camera.
+
+        Args:
+            index: the frame's, from 0 to len - 1.
+
+        Returns:
+            (H, W, 3) uint8 red, green, blue: the pixels of the grey image.
 
         Raises:
             UnusableFrame: it cannot be read.
