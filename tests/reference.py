@@ -118,3 +118,18 @@ def residual(
     X, Y, Z = (T_camera_body @ np.linalg.inv(T_world_body) @ np.append(p, 1.0))[:3]
     last = 0.0 if np.isnan(disparity) else baseline / Z - disparity
     return np.array([X / Z - xy[0], Y / Z - xy[1], last]) * (weights[0], weights[0], weights[1])
+
+
+def kannala_brandt(x: float, y: float, z: float, k: Array) -> tuple[float, float]:
+    theta = np.arccos(z / np.sqrt(x * x + y * y + z * z))
+    r = theta + sum(k[i] * theta ** (2 * i + 3) for i in range(4))
+    azimuth = np.arctan2(y, x)
+    return r * np.cos(azimuth), r * np.sin(azimuth)
+
+
+def double_sphere(x: float, y: float, z: float, xi: float, alpha: float) -> tuple[float, float]:
+    on_sphere = np.array([x, y, z]) / np.sqrt(x * x + y * y + z * z) + [0, 0, xi]
+    on_second = on_sphere / np.linalg.norm(on_sphere) + [0, 0, alpha / (1 - alpha)]
+    # The pinhole's plane is where the axis has focal length 1 before both shifts.
+    u, v = on_second[:2] / on_second[2]
+    return u / (1 - alpha), v / (1 - alpha)

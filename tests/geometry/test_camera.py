@@ -158,7 +158,7 @@ GOOD = {
         ({"intrinsics": [500.0, -500.0, 320.0, 240.0]}, "must be above 0"),
         ({"intrinsics": [500.0, np.nan, 320.0, 240.0]}, "NaN"),
         ({"intrinsics": "f"}, "not a list of numbers"),
-        ({"distortion": [0.1, 0.2, 0.3]}, "3 numbers, give 0, 4, 5, 8"),
+        ({"distortion": [0.1, 0.2, 0.3]}, "3 numbers, a pinhole camera has 0 or 4 or 5 or 8"),
         ({"distortion": [0.1, np.inf, 0.0, 0.0]}, "NaN or infinite"),
         ({"resolution": (0, 480)}, "whole pixels above 0"),
         ({"resolution": (640.5, 480)}, "whole pixels"),

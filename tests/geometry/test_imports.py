@@ -6,7 +6,7 @@ import pytest
 
 from odomap.geometry import lens_kernels, lie_kernels, p3p_kernels, pnp_kernels
 
-LIGHT = ("lie", "pose", "camera", "rectify", "robust", "leastsquares", "ransac")
+LIGHT = ("lie", "pose", "camera", "rectify", "undistort", "robust", "leastsquares", "ransac")
 LIGHT += ("align", "trajectory", "triangulate", "fivepoint", "twoview", "pnp")
 
 

@@ -77,6 +77,16 @@ def test_cropped_images_are_fine() -> None:
     assert CameraMount("left", lens).camera == lens
 
 
+def test_fisheyes_have_shorter_focal_lengths() -> None:
+    # A circle of 220° in a wide image, as the double sphere counts it.
+    circle = Camera("double_sphere", [170.0, 170.0, 960.0, 540.0], [-0.35, 0.6], (1920, 1080))
+    assert CameraMount("left", circle).camera == circle
+    with pytest.raises(CalibrationError, match="fx = 170 px cannot be"):
+        CameraMount("left", Camera("pinhole", circle.intrinsics, [], (1920, 1080)))
+    with pytest.raises(CalibrationError, match="fx = 1 px cannot be"):
+        CameraMount("left", Camera("kannala_brandt", [1, 1, 320, 240], [0, 0, 0, 0], (640, 480)))
+
+
 def test_names() -> None:
     with pytest.raises(CalibrationError, match="two sensors are named 'a'"):
         Rig((mount("a"), mount("a")))

@@ -1,8 +1,8 @@
 """Compiled lens formulas, for callers that handle one point at a time.
 
 The problem: undistorting is an iteration per point; with arrays every point waits for the slowest,
-compiled each stops when it is done (3-4 Newton steps, 0.1 µs). Formulas as in `camera`, with the
-coefficients always padded to eight: k₁ k₂ p₁ p₂ k₃ k₄ k₅ k₆.
+compiled each stops when it is done (3-4 Newton steps, 0.1 µs). Formulas as in `lenses`, with the
+coefficients always padded to eight, k₁ k₂ p₁ p₂ k₃ k₄ k₅ k₆, and as in `fisheye` with four.
 
 Reference: J. Heikkilä, O. Silvén, "A four-step camera calibration procedure with implicit image
 correction", CVPR 1997.
@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["radtan_distort", "radtan_undistort", "radtan_undistort_rows", "warm_up"]
+__all__ = [
+    "kb_angle",
+    "kb_angles",
+    "radtan_distort",
+    "radtan_undistort",
+    "radtan_undistort_rows",
+    "warm_up",
+]
 
 Array = NDArray[np.float64]
 
@@ -79,9 +86,49 @@ def radtan_undistort_rows(plane: Array, d: Array, reach: float, out: Array) -> N
         out[i, 0], out[i, 1] = radtan_undistort(plane[i, 0], plane[i, 1], d, reach)
 
 
+@kernel
+def kb_angle(radius: float, k: Array, reach: float) -> float:
+    """Solve θ + k₁θ³ + k₂θ⁵ + k₃θ⁷ + k₄θ⁹ = radius for 0 <= θ < reach; NaN if there is none.
+
+    Newton's method inside a bracket that every step narrows: r grows up to reach, so that where a
+    step leaves the bracket, or the slope vanishes, halving it is always right.
+    """
+    if not radius >= 0.0:
+        return np.nan
+    low, high = 0.0, reach
+    theta = min(radius, 0.5 * reach)
+    for _ in range(100):
+        s = theta * theta
+        miss = theta * (1.0 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))) - radius
+        if miss == 0.0:
+            break
+        if miss > 0.0:
+            high = theta
+        else:
+            low = theta
+        slope = 1.0 + s * (3.0 * k[0] + s * (5.0 * k[1] + s * (7.0 * k[2] + s * 9.0 * k[3])))
+        step = theta - miss / slope if slope > 1e-12 else low - 1.0
+        if not low < step < high:
+            step = 0.5 * (low + high)
+        if abs(step - theta) <= 4e-16 * theta:
+            break
+        theta = step
+    # Beyond the largest radius the bracket closes on reach and the equation stays open.
+    return theta if abs(miss) <= 1e-12 * (1.0 + radius) and theta < reach else np.nan
+
+
+@kernel
+def kb_angles(radii: Array, k: Array, reach: float, out: Array) -> None:
+    """out[i] = r⁻¹(radii[i]) for (N,) radii."""
+    for i in range(radii.shape[0]):
+        out[i] = kb_angle(radii[i], k, reach)
+
+
 def warm_up() -> None:
     """Compile the kernels of this file."""
     plane, d = np.zeros((1, 2)), np.zeros(8)
     radtan_distort(0.1, 0.1, d)
     radtan_undistort(0.1, 0.1, d, np.inf)
     radtan_undistort_rows(plane, d, np.inf, np.empty_like(plane))
+    kb_angle(0.1, np.zeros(4), np.pi)
+    kb_angles(np.zeros(1), np.zeros(4), np.pi, np.empty(1))

@@ -28,7 +28,10 @@ __all__ = ["CameraMount", "DepthMount", "ImuMount", "LidarMount", "Rig"]
 BASELINE_M = (0.005, 5.0)
 """Shortest and longest distance of the cameras of a stereo pair."""
 FOCAL_PER_SIZE = (0.1, 30.0)
-"""Smallest and largest focal length, in image sizes."""
+"""Smallest and largest focal length of a pinhole, in image sizes."""
+FISHEYE_FOCAL_PER_SIZE = (0.03, 30.0)
+"""The same for other lenses: a fisheye's picture may be a circle in a wide image, and a double
+sphere's focal length is that of the lens times 1 + xi."""
 CENTRE_PER_HALF = (0.62, 1.6)
 """A principal point is near the centre; one that is off by more, in both axes and to the same side,
 belongs to an image of another size."""
@@ -221,7 +224,7 @@ def check_camera(name: str, camera: Camera) -> None:
     """Raise a CalibrationError unless focal length and principal point suit the image size."""
     width, height = camera.width, camera.height
     size = f"{width}x{height} images"
-    low, high = FOCAL_PER_SIZE
+    low, high = FOCAL_PER_SIZE if camera.model == "pinhole" else FISHEYE_FOCAL_PER_SIZE
     for axis, focal, length in (("fx", camera.fx, width), ("fy", camera.fy, height)):
         if not low * length <= focal <= high * length:
             raise CalibrationError(
