@@ -14,8 +14,9 @@ Version 1 (lengths in metres, times in seconds, T_a_b maps b to a, four rows of 
       - {name: top, T_body_lidar: [[...], ...], range_m: [0.5, 100.0], rate_hz: 10.0,
          sweep: clockwise}
 
-A mount that is not given is the identity. Unknown fields are errors, so that a typo is not a
-default.
+Models and their coefficients are those of `geometry.camera`: pinhole, kannala_brandt (k1 k2 k3 k4),
+double_sphere (xi, alpha). A mount that is not given is the identity. Unknown fields are errors, so
+that a typo is not a default.
 """
 
 from pathlib import Path
@@ -31,7 +32,7 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import CameraMount, DepthMount, ImuMount, LidarMount, Rig
 
-__all__ = ["VERSION", "read_rig", "write_rig"]
+__all__ = ["VERSION", "located", "read_rig", "write_rig"]
 
 VERSION = 1
 
@@ -95,7 +96,7 @@ def _camera(fields: Fields) -> CameraMount:
             fields.number("time_offset_s", 0.0),
         )
     except InputError as error:
-        raise _located(fields, error) from error
+        raise located(fields, error) from error
 
 
 def _depth(fields: Fields) -> DepthMount:
@@ -106,7 +107,7 @@ def _depth(fields: Fields) -> DepthMount:
             fields.text("camera"), fields.number("factor", 5000.0), tuple(int(v) for v in invalid)
         )
     except InputError as error:
-        raise _located(fields, error) from error
+        raise located(fields, error) from error
 
 
 def _imu(fields: Fields) -> ImuMount:
@@ -118,7 +119,7 @@ def _imu(fields: Fields) -> ImuMount:
     try:
         return ImuMount(**values, T_body_imu=T_body_imu)
     except InputError as error:
-        raise _located(fields, error) from error
+        raise located(fields, error) from error
 
 
 def _lidar(fields: Fields) -> LidarMount:
@@ -136,11 +137,11 @@ def _lidar(fields: Fields) -> LidarMount:
             (float(first), float(last), int(beams)),
         )
     except InputError as error:
-        raise _located(fields, error) from error
+        raise located(fields, error) from error
 
 
-def _located(fields: Fields, error: InputError) -> InputError:
-    """Say where, unless the error does so already."""
+def located(fields: Fields, error: InputError) -> CalibrationError:
+    """Return an error that says where, unless it does so already."""
     message = str(error)
     if not message.startswith(fields.where):
         message = f"{fields.where}: {message}"

@@ -61,7 +61,8 @@ class KannalaBrandt:
         radius, slope = _radius(np.arctan2(rho, z), distortion)
         scale = _ratio(radius, rho, z)
         n = points[:, :2] / np.where(rho > 0, rho, 1.0)[:, None]
-        turn = slope / (rho * rho + z * z)
+        square = rho * rho + z * z
+        turn = slope / np.where(square > 0, square, np.nan)
         out = np.empty((len(points), 2, 3))
         out[:, :, :2] = n[:, :, None] * n[:, None, :] * (turn * z - scale)[:, None, None]
         out[:, 0, 0] += scale
@@ -94,7 +95,7 @@ def _radius(theta: Array, k: Array) -> tuple[Array, Array]:
 def _ratio(radius: Array, rho: Array, z: Array) -> Array:
     """Return r/ρ; 1/z on the axis, NaN on its far side, where no direction is right."""
     axis = 1.0 / np.where(z > 0, z, np.nan)
-    return np.asarray(np.where(rho > 0, radius / np.where(rho > 0, rho, 1.0), axis))
+    return np.asarray(np.where(rho == 0, axis, radius / np.where(rho == 0, 1.0, rho)))
 
 
 class DoubleSphere:
@@ -134,6 +135,7 @@ class DoubleSphere:
         d2 = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + w * w)
         below = alpha * d2 + (1.0 - alpha) * w
         below = np.where(below > 0, below, np.nan)
+        d1, d2 = np.where(d1 > 0, d1, np.nan), np.where(d2 > 0, d2, np.nan)
         grad_w = xi * points / d1[:, None]
         grad_w[:, 2] += 1.0
         grad_d2 = grad_w * w[:, None]

@@ -93,7 +93,7 @@ def kb_angle(radius: float, k: Array, reach: float) -> float:
     Newton's method inside a bracket that every step narrows: r grows up to reach, so that where a
     step leaves the bracket, or the slope vanishes, halving it is always right.
     """
-    if not radius >= 0.0:
+    if not 0.0 <= radius < np.inf:
         return np.nan
     low, high = 0.0, reach
     theta = min(radius, 0.5 * reach)

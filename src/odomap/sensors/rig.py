@@ -234,10 +234,11 @@ def check_camera(name: str, camera: Camera) -> None:
     ratios = np.array([camera.cx / (width / 2), camera.cy / (height / 2)])
     low, high = CENTRE_PER_HALF
     if np.all(ratios < low) or np.all(ratios > high):
+        mend = f"Scale intrinsics by {1 / ratios.mean():.3g}" if ratios.mean() > 0.05 else ""
         raise CalibrationError(
             f"camera '{name}': principal point ({camera.cx:g}, {camera.cy:g}) px is far from the "
-            f"centre of {size}: calibrated for another resolution? "
-            f"Scale intrinsics by {1 / ratios.mean():.3g}"
+            f"centre of {size}: "
+            + (f"calibrated for another resolution? {mend}" if mend else "give cx, cy in pixels")
         )
 
 
