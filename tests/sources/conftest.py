@@ -119,3 +119,61 @@ def save_image() -> Callable[[Path, NDArray[np.generic]], None]:
 @pytest.fixture
 def draw() -> Callable[..., NDArray[np.uint8]]:
     return picture
+
+
+def write_clip(
+    path: Path,
+    frames: int = 12,
+    code: str = "mp4v",
+    size: tuple[int, int] = (128, 96),
+    rate_hz: float = 30.0,
+) -> Path:
+    """Write a video whose frames say which they are (`number_of`), and its rig.yaml beside it."""
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), rate_hz, size
+    )
+    assert writer.isOpened()
+    ground = np.random.default_rng(0).integers(60, 190, (size[1] // 8, size[0] // 8), np.uint8)
+    for index in range(frames):
+        image = np.roll(ground, index, 1).repeat(8, 0).repeat(8, 1)
+        for bit in range(8):
+            image[:8, 8 * bit : 8 * bit + 8] = 255 * (index >> bit & 1)
+        # Blue, green, red: a red that says what colour is.
+        writer.write(np.dstack([image // 2, image, image]))
+    writer.release()
+    write_camera(path.with_name("rig.yaml"), size)
+    return path
+
+
+def write_camera(path: Path, size: tuple[int, int], rate_hz: float = 30.0) -> Path:
+    """Write a rig.yaml of one camera."""
+    width, height = size
+    path.write_text(
+        f"""odomap_rig: 1
+cameras:
+  - {{name: cam, intrinsics: [{width}, {width}, {width / 2}, {height / 2}],
+     resolution: [{width}, {height}], rate_hz: {rate_hz}}}
+"""
+    )
+    return path
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Callable[..., Path]:
+    return lambda name="clip.mp4", **options: write_clip(tmp_path / name, **options)
+
+
+@pytest.fixture
+def calibrate() -> Callable[..., Path]:
+    return write_camera
+
+
+@pytest.fixture
+def number_of() -> Callable[[NDArray[np.uint8]], int]:
+    """Return which frame of a clip an image is."""
+
+    def number(image: NDArray[np.uint8]) -> int:
+        bits = [image[2:6, 8 * bit + 2 : 8 * bit + 6].mean() > 127 for bit in range(8)]
+        return sum(int(is_set) << bit for bit, is_set in enumerate(bits))
+
+    return number

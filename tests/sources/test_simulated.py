@@ -45,6 +45,14 @@ def test_names_and_files_say_the_same(tmp_path: Path) -> None:
     assert not is_simulated(tmp_path / "elsewhere")
 
 
+def test_a_name_may_choose_the_lens() -> None:
+    source = SimulatedSource("sim:room?lens=double_sphere&frames=1&resolution=96x64")
+    assert {m.camera.model for m in source.rig.cameras} == {"double_sphere"}
+    assert next(iter(source)).images[0].shape == (64, 96)
+    with pytest.raises(ConfigError, match=r"lens: 'kanala_brandt'.*did you mean 'kannala_brandt'"):
+        read_spec("sim:room?lens=kanala_brandt")
+
+
 def test_exported_images_come_back_through_the_euroc_reader(
     source: SimulatedSource, tmp_path: Path
 ) -> None:

@@ -12,13 +12,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Info"]
 
+VARIES = 1.5
+"""A rate varies if the longest step between frames is so many shortest ones."""
+
 
 @dataclass(frozen=True)
 class Info:
     """Say what a recording holds: frames, sensors, calibration, gaps, ground truth."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A recording (EuRoC ASL, KITTI odometry), a world.yaml, or 'sim:room?seed=3&frames=100'."""
+    """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images), a camera ('camera:0'), a
+    world.yaml, or 'sim:room?seed=3&frames=100'."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
     check: bool = False
@@ -62,6 +66,13 @@ def lines(facts: dict[str, Any]) -> list[str]:
     rows += [(f"camera {camera['name']}", _camera(camera)) for camera in facts["cameras"]]
     if facts["stereo_baseline_m"]:
         rows.append(("baseline", f"{facts['stereo_baseline_m']:.4f} m"))
+    if facts["depth"]:
+        rows.append(("depth", _depth(facts["depth"])))
+    rows += [
+        (name.removesuffix("_deg").replace("_", " "), _detail(name, value))
+        for name, value in facts["details"].items()
+        if value
+    ]
     if facts["imu_rate_hz"]:
         rows.append(("imu", f"{facts['imu_rate_hz']:g} Hz"))
     rows += [("lidar", name) for name in facts["lidars"]]
@@ -76,12 +87,31 @@ def lines(facts: dict[str, Any]) -> list[str]:
 
 
 def _times(facts: dict[str, Any]) -> str:
+    if facts["frames"] is None:
+        return "unknown: it is live"
     text = str(facts["frames"])
     if facts["duration_s"] is not None:
         text += f" in {facts['duration_s']:.2f} s"
     if facts["rate_hz"]:
         text += f", {facts['rate_hz']:g} Hz"
+    if facts["steps_s"] and facts["steps_s"][1] > VARIES * facts["steps_s"][0]:
+        low, high = (1e3 * step for step in facts["steps_s"])
+        text += f" (varies: {low:.3g} to {high:.3g} ms apart)"
     return text
+
+
+def _depth(depth: dict[str, Any]) -> str:
+    text = f"{depth['factor']:g} per metre, registered to {depth['camera']}"
+    if "frames" in depth:
+        text += (
+            f", of {depth['frames']} frames; {depth['offset_median_ms']:+g} ms from colour, "
+            f"{depth['offset_largest_ms']:g} ms at most"
+        )
+    return text
+
+
+def _detail(name: str, value: object) -> str:
+    return f"{value}°" if name.endswith("_deg") else str(value)
 
 
 def _camera(camera: dict[str, Any]) -> str:

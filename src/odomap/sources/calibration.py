@@ -9,14 +9,24 @@ Reference: Z. Zhang, "A flexible new technique for camera calibration", IEEE Tra
 and Machine Intelligence 22(11), 2000.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from odomap.errors import CalibrationError
-from odomap.files.rig import read_rig
+from odomap.files.calibrations import read_calibration
+from odomap.geometry.pose import SE3
 from odomap.sensors.rig import CameraMount, Rig
 
-__all__ = ["HOW_TO", "check_resolution", "load_rig", "rig_beside", "size_text"]
+__all__ = [
+    "HOW_TO",
+    "check_resolution",
+    "find_rig",
+    "load_rig",
+    "one_camera",
+    "rig_beside",
+    "size_text",
+]
 
 HOW_TO = (
     "make one from pictures of a chessboard with 'odomap calibrate PICTURES --board 9x6 "
@@ -31,12 +41,40 @@ def load_rig(rig: Rig | str | Path) -> Rig:
         CalibrationError: the file is no calibration.
         InputError: it cannot be read.
     """
-    return rig if isinstance(rig, Rig) else read_rig(rig)
+    return rig if isinstance(rig, Rig) else read_calibration(rig)
 
 
 def rig_beside(candidates: Iterable[Path]) -> Rig | None:
     """Return the rig of the first of some files that is there, or None."""
     return next((load_rig(file) for file in candidates if file.is_file()), None)
+
+
+def find_rig(rig: Rig | None, candidates: Sequence[Path], where: Path | str) -> Rig:
+    """Return the given rig, or that of the first of some files that is there.
+
+    Raises:
+        CalibrationError: there is none; says how to make one.
+    """
+    found = rig_beside(candidates) if rig is None else rig
+    if found is None:
+        names = " nor ".join(str(file) for file in candidates)
+        raise CalibrationError(
+            f"{where}: there is no calibration (neither --rig nor {names}): {HOW_TO}"
+        )
+    return found
+
+
+def one_camera(rig: Rig, where: Path | str) -> Rig:
+    """Return the rig of a single camera, which is the body, as a path without scale demands.
+
+    Raises:
+        CalibrationError: the rig has more cameras than one, or none.
+    """
+    if len(rig.cameras) != 1:
+        raise CalibrationError(
+            f"{where}: is of one camera, but its calibration has {len(rig.cameras)}: list that one"
+        )
+    return Rig((replace(rig.cameras[0], T_body_camera=SE3.identity()),))
 
 
 def size_text(size: tuple[int, int]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from odomap.errors import CalibrationError
 from odomap.sensors.rig import Rig
+from odomap.sources.depth import DepthFiles
 from odomap.sources.source import RandomAccess, Source
 
 __all__ = ["describe"]
@@ -25,13 +26,14 @@ def describe(source: Source) -> dict[str, Any]:
 
     Returns:
         Plain numbers, texts, lists and mappings: name, format, frames, duration_s, rate_hz, gaps,
-        cameras, stereo_baseline_m, imu_rate_hz, lidars, body, truth, skipped, notes.
+        steps_s, cameras, stereo_baseline_m, depth, imu_rate_hz, lidars, body, details, truth,
+        skipped, notes. Frames are None where they cannot be counted, as of a live camera.
     """
     rig = source.rig
     return {
         "name": source.name,
         "format": type(source).__name__.strip("_").removesuffix("Source").lower(),
-        "frames": len(source),
+        "frames": len(source) or None,
         **_times(source),
         "cameras": [
             {
@@ -45,9 +47,11 @@ def describe(source: Source) -> dict[str, Any]:
             for mount in rig.cameras
         ],
         "stereo_baseline_m": _baseline(rig),
+        "depth": _depth(source),
         "imu_rate_hz": None if rig.imu is None else rig.imu.rate_hz,
         "lidars": [mount.name for mount in rig.lidars],
         "body": rig.body_sensor,
+        "details": dict(getattr(source, "details", {})),
         "truth": _truth(source),
         "skipped": [f"{item.file}: {item.reason}" for item in source.skipped],
         "notes": list(getattr(source, "notes", [])),
@@ -56,11 +60,11 @@ def describe(source: Source) -> dict[str, Any]:
 
 def _times(source: Source) -> dict[str, Any]:
     if not isinstance(source, RandomAccess) or len(source) == 0:
-        return {"duration_s": None, "rate_hz": None, "gaps": []}
+        return {"duration_s": None, "rate_hz": None, "steps_s": None, "gaps": []}
     stamps = source.stamps_ns
     steps = np.diff(stamps)
     if len(steps) == 0:
-        return {"duration_s": 0.0, "rate_hz": None, "gaps": []}
+        return {"duration_s": 0.0, "rate_hz": None, "steps_s": None, "gaps": []}
     usual = float(np.median(steps))
     gaps = [
         {"after_frame": int(i), "stamp_s": float(stamps[i] * 1e-9), "gap_s": float(steps[i] * 1e-9)}
@@ -69,8 +73,25 @@ def _times(source: Source) -> dict[str, Any]:
     return {
         "duration_s": float((stamps[-1] - stamps[0]) * 1e-9),
         "rate_hz": round(1e9 / usual, 3),
+        "steps_s": [float(steps.min() * 1e-9), float(steps.max() * 1e-9)],
         "gaps": gaps,
     }
+
+
+def _depth(source: Source) -> dict[str, Any] | None:
+    """Return the factor of depth, and how well it is paired with colour."""
+    files, mount = getattr(source, "depth", None), source.rig.depth
+    if mount is None:
+        return None
+    facts: dict[str, Any] = {"camera": mount.camera, "factor": mount.factor}
+    if isinstance(files, DepthFiles):
+        offsets_ms = files.paired * 1e-6
+        facts |= {
+            "frames": len(offsets_ms),
+            "offset_median_ms": round(float(np.median(offsets_ms)), 3),
+            "offset_largest_ms": round(float(np.abs(offsets_ms).max()), 3),
+        }
+    return facts
 
 
 def _baseline(rig: Rig) -> float | None:

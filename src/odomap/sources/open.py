@@ -5,6 +5,7 @@ Recognised by what a folder holds, not by its name:
     EuRoC ASL         mav0/cam0/data.csv (or the inside of mav0)
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
+    video             a file: clip.mp4, .mov, .avi, .mkv, ...
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
 A path that leads nowhere is answered with what stands nearest to it.
@@ -13,18 +14,19 @@ A path that leads nowhere is answered with what stands nearest to it.
 from pathlib import Path
 
 from odomap.errors import InputError, nearest_name
-from odomap.files.rig import read_rig
 from odomap.sensors.rig import Rig
+from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.kitti import KittiSource, is_kitti
 from odomap.sources.source import Source
 from odomap.sources.tum import TumSource, is_tum
+from odomap.sources.video import VideoSource, is_video
 
 __all__ = ["SUPPORTED", "open"]
 
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
-    "TUM RGB-D (rgb.txt, depth.txt), "
+    "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
 
@@ -61,6 +63,8 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
     if root.is_file():
         if root.suffix.lower() in (".yaml", ".yml"):
             return _simulated(str(root), rig)
+        if is_video(root):
+            return VideoSource(root, None if rig is None else load_rig(rig))
         raise InputError(f"{root}: files of this kind cannot be opened; supported are {SUPPORTED}")
     if (root / "world.yaml").exists():
         return _simulated(str(root / "world.yaml"), rig)
@@ -72,16 +76,13 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
 
 
 def _rig(root: Path, rig: Rig | str | Path | None) -> Rig | None:
-    if isinstance(rig, Rig):
-        return rig
     if rig is not None:
-        return read_rig(rig)
-    inside = root / "rig.yaml"
+        return load_rig(rig)
     calibrated = any(
         (root / name).exists()
         for name in ("calib.txt", "mav0/cam0/sensor.yaml", "cam0/sensor.yaml")
     )
-    return read_rig(inside) if inside.exists() and not calibrated else None
+    return None if calibrated else rig_beside([root / "rig.yaml"])
 
 
 def _simulated(spec: str, rig: Rig | str | Path | None) -> Source:
