@@ -6,8 +6,8 @@ probing: O(1). A voxel p, seen at pixel π(T⁻¹p) with depth z there and its o
 
     d = (z - Z) · slant,      D ← (W D + w d) / (W + w),      W ← W + w
 
-if d >= -band; d is cut at +band in front. w falls with depth, and behind the surface with d: what
-lies behind was not seen, and may be another surface.
+if d >= -band; d is cut at +band in front. The noise of depth grows with z², so w falls with z⁴; and
+it falls behind the surface: what lies there was not seen, and may be another one.
 
 Reference: B. Curless, M. Levoy, "A volumetric method for building complex models from range
 images", SIGGRAPH 1996; M. Nießner et al., "Real-time 3D reconstruction at scale using voxel
@@ -134,7 +134,7 @@ def integrate_kernel(
 ) -> None:  # fmt: skip
     """D ← (W D + w d) / (W + w) over all voxels that the camera sees; T maps world to camera.
 
-    w = slant / z² · (1 + d / band if d < 0). shape: voxel, band, share of jumps, most weight,
+    w = slant / z⁴ · (1 + d / band if d < 0). shape: voxel, band, share of jumps, most weight,
     weight of free space. Colours are means over views, in 1/256 of a grey level.
     """
     voxel, band, jump, most, free = shape[0], shape[1], shape[2], shape[3], shape[4]
@@ -185,7 +185,7 @@ def integrate_kernel(
                     d = (z - Z) * slant
             if d < -band:
                 continue
-            w = slant / (z * z)
+            w = slant / (z * z * z * z)
             if d > band:
                 d, w = band, free * w
             elif d < 0.0:
