@@ -8,7 +8,9 @@ The body is the IMU where there is one, else the first camera, else the LiDAR.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,15 @@ START_NS = 1_700_000_000_000_000_000
 """Stamp of the first frame: an epoch of our days, so that float seconds are caught losing time."""
 SENSORS = ("stereo", "mono", "depth", "imu", "lidar2d", "lidar3d")
 KINDS = ("room", "street")
+LENSES: Mapping[str, tuple[str, float, tuple[float, ...]]] = MappingProxyType(
+    {
+        "radtan": ("pinhole", 1.0, (-0.28, 0.07, 2e-4, -1e-4)),
+        "kannala_brandt": ("kannala_brandt", 0.48, (3.5e-3, 7e-4, -2e-3, 2e-4)),
+        "double_sphere": ("double_sphere", 0.385, (-0.2, 0.59)),
+    }
+)
+"""Camera model, focal length relative to the pinhole's, and distortion: those of EuRoC's lenses, of
+TUM-VI's, and of a double sphere much like TUM-VI's."""
 R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -65,11 +76,21 @@ class WorldSpec:
     """How many things move through the scene."""
     sensors: tuple[str, ...] = ("stereo", "imu")
     """Which of stereo, mono, depth, imu, lidar2d, lidar3d the rig carries."""
+    lens: str = "pinhole"
+    """What the cameras look through: "pinhole", "radtan" (a wide lens that bends lines),
+    "kannala_brandt" or "double_sphere" (fisheyes of 190° across). All but the first take about ten
+    times as long to render."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ConfigError(
                 f"kind: '{self.kind}' is none of room, street{nearest_name(self.kind, KINDS)}"
+            )
+        lenses = ("pinhole", *LENSES)
+        if self.lens not in lenses:
+            known = ", ".join(lenses)
+            raise ConfigError(
+                f"lens: '{self.lens}' is none of {known}{nearest_name(self.lens, lenses)}"
             )
         for sensor in self.sensors:
             if sensor not in SENSORS:
@@ -243,10 +264,12 @@ def _carried(spec: WorldSpec) -> Rig:
     is_room = spec.kind == "room"
     width, height = spec.resolution
     focal = 0.625 * width if is_room else 0.6 * width
+    model, magnified, distortion = LENSES.get(spec.lens, ("pinhole", 1.0, ()))
+    focal *= magnified
     camera = Camera(
-        "pinhole",
+        model,
         np.array([focal, focal, width / 2 - 0.5 + 3.3, height / 2 - 0.5 - 2.1]),
-        np.zeros(0),
+        np.array(distortion),
         (width, height),
     )
     R_imu_carrier = R_CARRIER_IMU.T if is_room else np.eye(3)
