@@ -49,6 +49,8 @@ Mask = NDArray[np.bool_]
 MIN_VIEWS = 3
 START_VIEWS = 12
 """Views, spread over all, by which starts are judged."""
+CLOSE_SECOND = 2.0
+"""A second start is tried if boards fit it at most so much worse than the first."""
 FOCAL_LADDER = np.geomspace(0.15, 2.0, 12)
 SIGMA_FLOOR_PX = 0.005
 """Corners are not better than that, even in rendered pictures."""
@@ -241,7 +243,8 @@ def _starts(points: Array, pixels: Array, blank: Camera) -> list[Camera]:
         # The median, so that a picture without a board in it has no say.
         rated.append((float(np.median(errors)), camera))
     rated.sort(key=lambda item: item[0])
-    return [camera for error, camera in rated[:2] if np.isfinite(error)]
+    limit = CLOSE_SECOND * rated[0][0]
+    return [camera for error, camera in rated[:2] if np.isfinite(error) and error <= limit]
 
 
 def _placed(

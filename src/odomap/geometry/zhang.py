@@ -28,6 +28,8 @@ from odomap.geometry.twoview import homography
 
 __all__ = ["intrinsics_of_plane_views", "pose_of_plane"]
 
+START_POINTS = 20
+
 
 def intrinsics_of_plane_views(homographies: ArrayLike, resolution: tuple[int, int]) -> list[Array]:
     """Return guesses of fx fy cx cy from pictures of a plane, the most general one first.
@@ -110,7 +112,7 @@ def pose_of_plane(points_plane: ArrayLike, pixels: ArrayLike, camera: Camera) ->
     """Find where a camera sees known points of the plane z = 0.
 
     Args:
-        points_plane: (N, 3) metres, z = 0, N ≥ 4.
+        points_plane: (N, 3) metres, z = 0, N ≥ 6.
         pixels: (N, 2) raw image.
         camera: the camera, at least roughly known.
 
@@ -123,9 +125,12 @@ def pose_of_plane(points_plane: ArrayLike, pixels: ArrayLike, camera: Camera) ->
     seen = np.isfinite(rays).all(axis=1)
     # The refinement works on x/z: what a fisheye sees beside or behind itself has no say there.
     ahead = np.where((rays[:, 2:] > 0.1) & seen[:, None], uv, np.nan)
-    if np.count_nonzero(seen) < 4:
+    if np.count_nonzero(seen) < 6:
         return SE3.identity(), np.inf
-    start = _pose_of_rays(points[seen], rays[seen])
+    # A start needs no more than a few points, spread over all of them.
+    count = np.count_nonzero(seen)
+    few = np.unique(np.linspace(0, count - 1, START_POINTS).round().astype(int))
+    start = _pose_of_rays(points[seen][few], rays[seen][few])
     if start is None:
         return SE3.identity(), np.inf
     best, least = start, _error(start, points, uv, camera)
