@@ -38,7 +38,7 @@ from odomap.simulation.world import World
 from odomap.sources.open import open as open_source
 from odomap.sources.simulated import read_spec
 from odomap.sources.source import Source
-from odomap.system.odometry import StereoVO
+from odomap.system.odometry import make_odometry
 
 KINDS = ("room", "street")
 LARGEST_PERCENT = 0.5
@@ -129,7 +129,8 @@ def _options() -> argparse.Namespace:
 def run(job: Job) -> Row:
     """Track one world and judge the path."""
     source = open_world(job)
-    system = StereoVO(source.rig, chosen_config(None, None, job.assignments))
+    config = chosen_config(None, None, job.assignments, source.rig)
+    system = make_odometry(source.rig, config)
     lost = 0
     for frame in source:
         estimate = system.track(frame)

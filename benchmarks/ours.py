@@ -20,7 +20,7 @@ from odomap.kernels import modules_with_kernels, warm_up
 from odomap.maps.estimate import Status
 from odomap.run import chosen_config
 from odomap.sources.open import open as open_source
-from odomap.system.odometry import StereoVO
+from odomap.system.odometry import make_odometry
 
 
 def main() -> None:
@@ -35,6 +35,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("data")
     parser.add_argument("prefix")
     parser.add_argument("--frames", type=int, default=0)
+    parser.add_argument("--preset", help="default the one for what the recording carries")
     parser.add_argument("--cv-threads", type=int, default=0, help="default 1, as in odomap run")
     parser.add_argument("--fast", action="store_true", help="do not wait for the sensor")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
@@ -48,7 +49,8 @@ def play(options: argparse.Namespace) -> None:
     assignments = [
         (name, value) for name, _, value in (text.partition("=") for text in options.set)
     ]
-    system = StereoVO(source.rig, chosen_config(None, None, assignments))
+    config = chosen_config(options.preset, None, assignments, source.rig)
+    system = make_odometry(source.rig, config)
     imported = set(sys.modules)
     for name in modules_with_kernels():
         if name in imported or name.startswith("odomap.geometry."):

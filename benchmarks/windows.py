@@ -7,7 +7,8 @@ from odomap.backend.bundle import Bundle
 from odomap.backend.motion import Sightings
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.system.mapping import WindowConfig
-from odomap.vision.stereo import StereoNoise
+from odomap.system.uncertainty import NoiseConfig
+from odomap.vision.stereo import StereoConfig
 
 FOCAL = 450.0
 BASELINE = 0.11
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 def window_problem(per_keyframe: int = 300, seed: int = 0) -> Bundle:
     """Return the bundle of one window: a camera goes forward, new points replace those it loses."""
     rng = np.random.default_rng(seed)
-    window, noise = WindowConfig(), StereoNoise()
+    window, noise, disparity_px = WindowConfig(), NoiseConfig(), StereoConfig().noise_px
     count = window.size + window.fixed
     Ts = np.array(
         [se3_exp(np.array([0.02 * k, 0.0, 0.08 * k, 0.0, 0.01 * k, 0.0])) for k in range(count)]
@@ -35,7 +36,7 @@ def window_problem(per_keyframe: int = 300, seed: int = 0) -> Bundle:
         pose.append(np.full(len(seen), k))
         point.append(seen)
         xy.append((pixels + rng.normal(0.0, noise.position_px, pixels.shape)) / FOCAL)
-        disparity.append(BASELINE / depth + rng.normal(0.0, noise.disparity_px, len(seen)) / FOCAL)
+        disparity.append(BASELINE / depth + rng.normal(0.0, disparity_px, len(seen)) / FOCAL)
     off = rng.normal(0.0, 1.0, (count, 6)) * [0.01, 0.01, 0.01, 0.003, 0.003, 0.003]
     is_fixed = np.arange(count) < window.fixed
     off[is_fixed] = 0.0
@@ -51,20 +52,20 @@ def window_problem(per_keyframe: int = 300, seed: int = 0) -> Bundle:
         np.zeros(rows, np.int64),
         np.concatenate(xy),
         np.concatenate(disparity),
-        np.tile(FOCAL / np.array([noise.position_px, noise.disparity_px]), (rows, 1)),
+        np.tile(FOCAL / np.array([noise.position_px, disparity_px]), (rows, 1)),
     )
 
 
 def motion_problem(count: int = 300, seed: int = 0) -> tuple[Array, Array, float, Sightings]:
     """Return T_world_body, T_camera_body, the baseline, and what is seen from there."""
     rng = np.random.default_rng(seed)
-    noise = StereoNoise()
+    noise, disparity_px = NoiseConfig(), StereoConfig().noise_px
     T = se3_exp(np.array([0.3, -0.1, 0.5, 0.05, -0.1, 0.02]))
     points = _points_ahead(rng, count, T)
     local = (points - T[:3, 3]) @ T[:3, :3]
     xy = local[:, :2] / local[:, 2:] + rng.normal(0.0, noise.position_px / FOCAL, (count, 2))
-    disparity = BASELINE / local[:, 2] + rng.normal(0.0, noise.disparity_px / FOCAL, count)
-    weights = np.tile(FOCAL / np.array([noise.position_px, noise.disparity_px]), (count, 1))
+    disparity = BASELINE / local[:, 2] + rng.normal(0.0, disparity_px / FOCAL, count)
+    weights = np.tile(FOCAL / np.array([noise.position_px, disparity_px]), (count, 1))
     return T, np.eye(4), BASELINE, Sightings(points, xy, disparity, weights)
 
 

@@ -350,7 +350,7 @@ def test_left_and_right_swapped(refused, euroc):
 
 def test_right_camera_missing(refused, euroc):
     shutil.rmtree(euroc / "mav0" / "cam1")
-    assert "stereo" in refused("run", euroc)
+    assert "stereo" in refused("run", euroc, "--preset", "stereo")
 
 
 # ---- bad input: calibration ----

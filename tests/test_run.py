@@ -200,7 +200,7 @@ def test_a_rig_without_a_pair_names_the_recording(world, tmp_path):
     source = Single(world, after=-1)
     source.rig = replace(world.rig, cameras=world.rig.cameras[:1])
     with pytest.raises(CalibrationError, match=r"^sim:room.*stereo needs two cameras"):
-        run(source)
+        run(source, preset="stereo")
 
 
 def estimate(k, status=Status.TRACKING, keyframe_id=0):

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from odomap.sources.open import open
     from odomap.sources.source import Source
     from odomap.system.config import Config, preset
-    from odomap.system.odometry import Result, StereoVO
+    from odomap.system.odometry import MonocularVO, Result, RgbdVO, StereoVO
 
 __all__ = [
     "SE2",
@@ -59,9 +59,11 @@ __all__ = [
     "InputError",
     "Map",
     "MissingExtra",
+    "MonocularVO",
     "OdomapError",
     "OutputError",
     "Result",
+    "RgbdVO",
     "Rig",
     "Sim3",
     "Source",
@@ -92,9 +94,11 @@ _HOMES = {
     "InputError": "errors",
     "Map": "maps.map",
     "MissingExtra": "errors",
+    "MonocularVO": "system.odometry",
     "OdomapError": "errors",
     "OutputError": "errors",
     "Result": "system.odometry",
+    "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
     "SE2": "geometry.pose",
     "SE3": "geometry.pose",

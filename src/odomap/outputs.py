@@ -78,7 +78,7 @@ class Outputs:
 
     def append(self, estimate: Estimate) -> None:
         """Append a live pose; lost frames have no row."""
-        if estimate.status == Status.LOST:
+        if estimate.status == Status.LOST or estimate.keyframe_id < 0:
             return
         try:
             if self._live is None:
@@ -114,6 +114,7 @@ class Outputs:
                 "trajectory_live.tum",
                 lambda: write_tum(self._at("trajectory_live.tum"), result.trajectory_live),
             ),
+            ("keyframes.tum", lambda: write_tum(self._at("keyframes.tum"), result.keyframes)),
             ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
             ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
             ("report.html", lambda: self._write_report(report)),
@@ -137,8 +138,14 @@ class Outputs:
         self, source: "Source", result: "Result", logbook: Logbook, metrics: dict[str, Any]
     ) -> "Report":
         """Gather what the report shows."""
+        import numpy as np
+
+        from odomap.geometry.pose import Sim3
         from odomap.views.record import Report, Sample
 
+        # A path without a scale is drawn at that of the truth, where there is one.
+        scale = metrics["ate"]["scale"] if metrics["ate"] and not result.is_metric else 1.0
+        shown = Sim3.from_parts(scale, np.eye(3), np.zeros(3))
         return Report(
             title=source.name,
             source=self._data,
@@ -147,8 +154,8 @@ class Outputs:
             config=self._config,
             rig=rig_text(source),
             estimates=logbook.estimates,
-            trajectory=result.trajectory,
-            truth=source.truth,
+            trajectory=result.trajectory.transformed(shown),
+            truth=None if source.truth is None else result.truth(source.truth),
             scores={"ATE": metrics["ate"]} if metrics["ate"] else {},
             metrics={name: metrics[name] for name in REPORTED},
             samples=[
@@ -157,7 +164,7 @@ class Outputs:
                 if frame.images and frame.images[0] is not None
             ],
             skipped=[(item.stamp_ns, item.file, item.reason) for item in source.skipped],
-            points=result.map.points_world(result.map.landmark_ids),
+            points=scale * result.map.points_world(result.map.landmark_ids),
         )
 
     def _write_report(self, report: "Report") -> None:

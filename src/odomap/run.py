@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from odomap.errors import CalibrationError, InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.logbook import Logbook, skipped_numbers, versions
-from odomap.maps.estimate import Estimate
+from odomap.maps.estimate import Estimate, Status
 from odomap.settings import override, read_config
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from odomap.sensors.rig import Rig
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.odometry import Result, StereoVO
+    from odomap.system.odometry import Odometry, Result
 
 __all__ = ["Interrupted", "Progress", "RunResult", "chosen_config", "run"]
 
@@ -110,7 +110,8 @@ def run(
     Args:
         data: a recording's folder, a world.yaml, "sim:room?seed=3&frames=100", or a `Source`.
         out: folder for the outputs; None writes nothing.
-        preset: name of a preset; default the first one.
+        preset: name of a preset; default the one for what the recording carries: rgbd, stereo
+            or mono.
         config: a `Config`, or a file to read over the preset.
         rig: a rig or rig.yaml, for recordings that do not say what is mounted where.
         rhythm: how stages follow each other; "inline", each in turn, is the only one yet.
@@ -139,15 +140,16 @@ def run(
     check_rhythm(rhythm)
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
-    settings = chosen_config(preset, config)
+    chosen_config(preset, config)  # a wrong name is told before anything is opened
     source = data if isinstance(data, Source) else _opened(data, rig)
+    settings = chosen_config(preset, config, rig=source.rig)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
     head |= ({"preset": preset} if preset else {}) | dict(origin or {})
     outputs = Outputs(out, settings, head) if out is not None else None
 
     tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
-    logbook = Logbook(min(len(source), max_frames or len(source)))
+    logbook = Logbook(_expected(source, max_frames))
     with deferred_interrupt() as interrupt:
         try:
             system = _system(source, settings, rhythm)
@@ -165,21 +167,24 @@ def chosen_config(
     preset: str | None = None,
     config: "Config | str | Path | None" = None,
     overrides: Sequence[tuple[str, str]] = (),
+    rig: "Rig | None" = None,
 ) -> "Config":
     """Return a preset, with a file read over it and single fields changed.
 
     Args:
-        preset: name of a preset; default the first one.
+        preset: name of a preset; default the one for the rig, or the first.
         config: a `Config`, which replaces the preset, or a file that is read over it.
         overrides: pairs such as ``("tracking.min_inliers", "20")``.
+        rig: what the recording carries.
 
     Raises:
         ConfigError: an unknown preset, section or field, or a value that cannot be.
+        CalibrationError: there is no preset for the rig: it has no camera.
     """
-    from odomap.system.config import PRESETS, Config
+    from odomap.system.config import PRESETS, Config, preset_for
     from odomap.system.config import preset as named_preset
 
-    name = preset or next(iter(PRESETS))
+    name = preset or (next(iter(PRESETS)) if rig is None else preset_for(rig))
     chosen = config if isinstance(config, Config) else named_preset(name)
     if isinstance(config, str | Path):
         chosen = read_config(config, chosen)
@@ -211,19 +216,19 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
     return time.perf_counter() - start
 
 
-def _system(source: "Source", settings: "Config", rhythm: str) -> "StereoVO":
+def _system(source: "Source", settings: "Config", rhythm: str) -> "Odometry":
     import cv2
 
-    from odomap.system.odometry import StereoVO
+    from odomap.system.odometry import make_odometry
 
     # The stages use the cores themselves; OpenCV's own threads would only get in their way.
     cv2.setNumThreads(1)
-    return StereoVO(source.rig, settings, rhythm)
+    return make_odometry(source.rig, settings, rhythm)
 
 
 def _track(
     source: "Source",
-    system: "StereoVO",
+    system: "Odometry",
     logbook: Logbook,
     outputs: "Outputs | None",
     max_frames: int | None,
@@ -231,7 +236,7 @@ def _track(
     interrupt: threading.Event,
 ) -> "Result":
     """Track frame after frame until the source, the limit or the user ends it."""
-    total = min(len(source), max_frames or len(source))
+    total = _expected(source, max_frames)
     for frame in source:
         start = time.perf_counter()
         estimate = system.worker.advance(frame)
@@ -243,6 +248,11 @@ def _track(
         if interrupt.is_set() or done == max_frames:
             break
     return system.finish()
+
+
+def _expected(source: "Source", max_frames: int | None) -> int:
+    """Return how many frames there are to track; 0 where nobody knows, as with a live camera."""
+    return min(n for n in (len(source) or max_frames or 0, max_frames or len(source)))
 
 
 def _concluded(
@@ -280,7 +290,11 @@ def _metrics(
 
     warnings = list(getattr(source, "notes", []))
     metrics: dict[str, Any] = {"name": source.name} | logbook.numbers() | skipped_numbers(source)
+    # Frames that were placed later have a pose now.
+    metrics["tracked"] = len(result.trajectory)
+    metrics["is_metric"] = result.is_metric
     metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
+    metrics["keyframes"] = len(result.keyframes)
     metrics["landmarks"] = result.map.num_landmarks
     metrics["loops"] = 0
     metrics["failure"] = logbook.failure()
@@ -288,12 +302,19 @@ def _metrics(
     metrics["ate"] = None
     if source.truth is not None:
         try:
-            found = ate(result.trajectory, source.truth)
+            align = "se3" if result.is_metric else "sim3"
+            found = ate(result.trajectory, result.truth(source.truth), align)
         except InputError as error:
             warnings.append(f"no comparison with the ground truth: {error}")
         else:
             metrics["ate_rmse_m"] = found.rmse
             metrics["ate"] = found.as_dict()
+    if not result.is_metric:
+        warnings.append("one camera cannot tell the scale: lengths are in units of their own")
+    anew = [e for e in logbook.estimates if e.is_keyframe and e.status == Status.INITIALIZING]
+    if anew:
+        times = "once" if len(anew) == 1 else f"{len(anew)} times"
+        warnings.append(f"tracking {anew[0].reason} (frame {anew[0].frame_id}, {times} in all)")
     if metrics["skipped"]:
         first, count = source.skipped[0], metrics["skipped"]
         what = "1 measurement" if count == 1 else f"{count} measurements, the first"

@@ -9,13 +9,14 @@ from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.mapping import WindowConfig, WindowMapper
+from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.features import Features
-from odomap.vision.stereo import StereoNoise
 
 BASELINE = 0.12
 CAMERA = Camera("pinhole", [400.0, 400.0, 319.5, 239.5], [], (640, 480))
 T_BODY_CAMERA = se3_exp(np.array([0.03, -0.02, 0.05, 0.3, -0.2, 0.1]))
-NOISE = StereoNoise(position_px=0.4, disparity_px=0.4)
+NOISE = NoiseConfig(position_px=0.4)
+SIGMA = 0.4 / (CAMERA.fx * BASELINE)
 
 
 class Walk:
@@ -28,7 +29,7 @@ class Walk:
         self.id_of = np.full(len(self.points), -1)
         window = WindowConfig() if window is None else window
         config = BundleConfig(iterations=8)
-        self.mapper = WindowMapper(self.map, T_BODY_CAMERA, CAMERA, BASELINE, window, config, NOISE)
+        self.mapper = WindowMapper(self.map, T_BODY_CAMERA, CAMERA, window, config, NOISE, SIGMA)
         self.truth = []
 
     def step(self, far=False):

@@ -67,6 +67,8 @@ class Bundle:
         xy: (N, 2) measured normalised image coordinates.
         disparity: (N,) measured disparity over focal length, NaN where there is none.
         weights: (N, 2) inverse standard deviations of xy and of the disparity.
+        is_scale_free: nothing measures how large the scene is: a single camera with one pose held.
+            The size of the path is then held too, that of the poses as they come.
     """
 
     Ts_world_body: Array
@@ -80,6 +82,7 @@ class Bundle:
     xy: Array
     disparity: Array
     weights: Array
+    is_scale_free: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.pose)
@@ -172,7 +175,7 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
         points,
         cameras,
         seen,
-        (config.huber_width, config.iterations, config.tolerance),
+        (config.huber_width, config.iterations, config.tolerance, bundle.is_scale_free),
         chi2,
         joint,
         response,
@@ -266,19 +269,43 @@ def _take_step(poses: PoseArrays, points: Array, trial: PoseArrays, moved: Array
 
 
 @kernel
+def _hold_scale(poses: PoseArrays, S: Array) -> None:
+    """S += λ g gᵀ, g the motion of all poses when the scene grows around the one held fixed."""
+    held = 0
+    while poses.column[held] >= 0:
+        held += 1
+    g, size, trace = np.zeros(len(S)), 0.0, 0.0
+    for i in range(len(poses.t)):
+        f = 6 * poses.column[i]
+        if f < 0:
+            continue
+        for a in range(3):
+            for b in range(3):
+                g[f + a] += poses.R[i, b, a] * (poses.t[i, b] - poses.t[held, b])
+            size += g[f + a] * g[f + a]
+    if not size > 0.0:
+        return
+    for a in range(len(S)):
+        trace += S[a, a]
+    for a in range(len(S)):
+        for b in range(a + 1):
+            S[a, b] += trace / size * g[a] * g[b]
+
+
+@kernel
 def _solve_kernel(
     poses: PoseArrays,
     points: Array,
     cameras: CameraArrays,
     seen: SightArrays,
-    limits: tuple[float, int, float],
+    limits: tuple[float, int, float, bool],
     chi2: Array,
     joint: Array,
     response: Array,
     costs: Array,
 ) -> tuple[int, int]:
     """Levenberg-Marquardt, poses and points in place; returns steps tried and a reason's index."""
-    width, iterations, tolerance = limits
+    width, iterations, tolerance, is_scale_free = limits
     size = len(joint)
     system = SystemArrays(
         np.empty((size, size)),
@@ -296,6 +323,8 @@ def _solve_kernel(
     while tried < iterations:
         tried += 1
         reduced_system(poses, points, cameras, seen, width, damping, system)
+        if is_scale_free:
+            _hold_scale(poses, system.S)
         trial = np.inf
         if factor(system.S):
             for a in range(size):
@@ -318,6 +347,8 @@ def _solve_kernel(
             damping, grow = max(damping, 1e-5) * grow, 2.0 * grow
     costs[1] = robust_cost(poses, points, cameras, seen, width, chi2)
     reduced_system(poses, points, cameras, seen, width, 0.0, system)
+    if is_scale_free:
+        _hold_scale(poses, system.S)
     if factor(system.S):
         invert(system.S, joint)
         disparity_response(poses, points, cameras, seen, width, system, response)

@@ -15,6 +15,7 @@ from odomap.cli.config import ConfigVerb
 from odomap.cli.demo import Demo
 from odomap.cli.doctor import Doctor
 from odomap.cli.evaluate import Evaluate
+from odomap.cli.export import Export
 from odomap.cli.info import Info
 from odomap.cli.run import Run
 from odomap.errors import InputError, nearest_name
@@ -26,6 +27,7 @@ VERBS: dict[str, Any] = {
     "run": Run,
     "demo": Demo,
     "eval": Evaluate,
+    "export": Export,
     "info": Info,
     "config": ConfigVerb,
     "doctor": Doctor,

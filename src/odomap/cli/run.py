@@ -27,11 +27,12 @@ class Run:
     """
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A recording (EuRoC ASL, KITTI odometry), a world.yaml, or 'sim:room?seed=3&frames=100'."""
+    """A recording (EuRoC, KITTI, TUM RGB-D), a video, a folder of images, camera:0, or a simulated
+    world ('sim:room?seed=3&frames=100')."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder for the outputs; default runs/NAME."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """A preset; `odomap config --list` names them."""
+    """A preset; default the one for the cameras there are; `odomap config --list` names them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A config file, read over the preset."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -49,12 +50,15 @@ class Run:
         from odomap.run import chosen_config
         from odomap.sources.open import open as open_source
 
-        config = chosen_config(self.preset, self.config, self.overrides)
+        chosen_config(self.preset, self.config, self.overrides)  # names are checked first
         source = open_source(self.data, self.rig)
+        config = chosen_config(self.preset, self.config, self.overrides, source.rig)
         out = self.out or Path("runs") / folder_name(source.name)
         command: dict[str, object] = {"data": self.data}
         if self.preset:
             command["preset"] = self.preset
+        if self.rig:
+            command["rig"] = str(self.rig)
         return track(source, out, config, command, self.max_frames, self.quiet)[0]
 
 
@@ -119,9 +123,12 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
         rate = f"{m['real_time_factor']:.2f} x real time" if m["real_time_factor"] else ""
         lines.append(("ms per frame", f"{ms['median']:.1f} median, {ms['p95']:.1f} p95  {rate}"))
         lines.append(("map", f"{m['keyframes']} keyframes, {m['landmarks']} landmarks"))
-        lines.append(("path", f"{m['path_m']:.3f} m in {m['duration_s']:.2f} s"))
+        unit = "m" if m["is_metric"] else "units (no scale)"
+        lines.append(("path", f"{m['path_m']:.3f} {unit} in {m['duration_s']:.2f} s"))
     if m.get("ate_rmse_m") is not None:
-        share = f" ({100 * m['ate_rmse_m'] / m['path_m']:.2f} % of the path)" if m["path_m"] else ""
-        lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}"))
+        path = m["path_m"] * m["ate"]["scale"]
+        share = f" ({100 * m['ate_rmse_m'] / path:.2f} % of the path)" if path else ""
+        fitted = "" if m["is_metric"] else ", scale fitted"
+        lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}{fitted}"))
     lines.append(("peak memory", f"{m['peak_memory_mb']:.0f} MB"))
     return lines

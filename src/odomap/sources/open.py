@@ -5,6 +5,7 @@ Recognised by what a folder holds, not by its name:
     EuRoC ASL         mav0/cam0/data.csv (or the inside of mav0)
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
+    image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
@@ -17,6 +18,7 @@ from odomap.errors import InputError, nearest_name
 from odomap.sensors.rig import Rig
 from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.euroc import EurocSource, is_euroc
+from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
 from odomap.sources.source import Source
 from odomap.sources.tum import TumSource, is_tum
@@ -27,6 +29,7 @@ __all__ = ["SUPPORTED", "open"]
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
+    "folders of images (one, or left/ and right/), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
 
@@ -72,6 +75,12 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
     for recognises, reader in readers:
         if recognises(root):
             return reader(root, _rig(root, rig))
+    calibration = _rig(root, rig)
+    outside = next((p for p in list(root.resolve().parents)[:3] if _is_recording(p)), None)
+    if outside is not None and calibration is None:
+        raise InputError(f"{root}: is a part of a recording: open {outside}")
+    if is_folder(root, calibration):
+        return FolderSource(root, calibration)
     raise InputError(_unrecognised(root))
 
 
@@ -83,6 +92,10 @@ def _rig(root: Path, rig: Rig | str | Path | None) -> Rig | None:
         for name in ("calib.txt", "mav0/cam0/sensor.yaml", "cam0/sensor.yaml")
     )
     return None if calibrated else rig_beside([root / "rig.yaml"])
+
+
+def _is_recording(path: Path) -> bool:
+    return is_euroc(path) or is_kitti(path) or is_tum(path)
 
 
 def _simulated(spec: str, rig: Rig | str | Path | None) -> Source:
@@ -105,11 +118,15 @@ def _unrecognised(root: Path) -> str:
     entries = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
     if not entries:
         return f"{root}: the folder is empty; supported are {SUPPORTED}"
-    for inside in sorted(p for p in (*root.glob("*/"), *root.glob("*/*/")) if p.is_dir()):
-        if is_euroc(inside) or is_kitti(inside):
-            return f"{root}: is not a recording itself, but holds one: open {inside}"
-    for outside in list(root.resolve().parents)[:3]:
-        if is_euroc(outside) or is_kitti(outside):
-            return f"{root}: is a part of a recording: open {outside}"
+    inside = sorted(p for p in (*root.glob("*/"), *root.glob("*/*/")) if p.is_dir())
+    for path in inside:
+        if _is_recording(path):
+            return f"{root}: is not a recording itself, but holds one: open {path}"
+    pictures = [path.name for path in inside if path.parent == root and image_folders(path)]
+    if pictures:
+        return (
+            f"{root}: holds folders of images ({', '.join(pictures)}): open one of them, or name "
+            "two 'left' and 'right', or as the cameras of the rig.yaml"
+        )
     found = ", ".join(entries[:5]) + (", ..." if len(entries) > 5 else "")
     return f"{root}: not recognised (it holds {found}); supported are {SUPPORTED}"

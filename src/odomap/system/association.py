@@ -9,7 +9,7 @@ Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Mo
 "ORB-SLAM", T-RO 2015, section V.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -35,6 +35,8 @@ Image = NDArray[np.uint8]
 class TrackingConfig:
     """How frames are placed and when one becomes a keyframe."""
 
+    sensors: Literal["mono", "stereo", "rgbd"] = "stereo"
+    """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image."""
     association: Literal["flow", "descriptors"] = "flow"
     """flow: patches followed by optical flow; descriptors: features matched in every frame."""
     min_inliers: int = 15
@@ -73,7 +75,48 @@ class View:
         return self.pyramid[0]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points of a keyframe without a place yet, since they were seen from one side only.
+
+    Attributes:
+        keypoints: (C, 2) float64 where, rectified pixels.
+        descriptors: (C, D) uint8, D = 0 where association does without.
+        first_at: (C, 2) where each was seen first.
+        keyframes: (C, V) ids of keyframes that have seen each, from the first one on; −1 for none.
+        rows: (C, V) at which of their keypoints.
+    """
+
+    keypoints: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    first_at: NDArray[np.float64]
+    keyframes: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def at(self, index: NDArray[np.int64]) -> "Candidates":
+        """Return some of them."""
+        return Candidates(
+            self.keypoints[index],
+            self.descriptors[index],
+            self.first_at[index],
+            self.keyframes[index],
+            self.rows[index],
+        )
+
+    def afresh(self, which: NDArray[np.bool_]) -> "Candidates":
+        """Return them with the history of some (C,) forgotten."""
+        gone = which[:, None]
+        return replace(
+            self,
+            keyframes=np.where(gone, -1, self.keyframes),
+            rows=np.where(gone, -1, self.rows),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Reference:
     """A keyframe as the tracker sees it.
 
@@ -83,10 +126,11 @@ class Reference:
         landmark_ids: (N,) landmarks seen in it.
         keypoints: (N, 2) float64 where, rectified pixels.
         descriptors: (N, D) uint8, D = 0 where association does without.
-        seen: (N,) number of keyframes that have seen each so far.
-        depth: (N,) metres along the optical axis, in this keyframe.
+        is_ranged: (N,) bool, whether a landmark's depth was measured rather than triangulated.
+        relative: (N,) standard deviation of a landmark's depth as a fraction of it.
         first_keyframe: (N,) keyframe each was first seen in.
         first_keypoint: (N, 2) where in its image.
+        candidates: what else is followed from it.
     """
 
     keyframe_id: int
@@ -94,10 +138,11 @@ class Reference:
     landmark_ids: NDArray[np.int64]
     keypoints: NDArray[np.float64]
     descriptors: NDArray[np.uint8]
-    seen: NDArray[np.int64]
-    depth: NDArray[np.float64]
+    is_ranged: NDArray[np.bool_]
+    relative: NDArray[np.float64]
     first_keyframe: NDArray[np.int64]
     first_keypoint: NDArray[np.float64]
+    candidates: Candidates
 
 
 class Association(Protocol):
@@ -109,13 +154,26 @@ class Association(Protocol):
 
     def find(
         self,
-        reference: Reference,
+        known: View,
+        keypoints: NDArray[np.float64],
+        descriptors: NDArray[np.uint8],
         view: View,
-        rows: NDArray[np.int64],
         guess: NDArray[np.float64],
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return pixels (n, 2) and found (n,) of rows of the reference, expected at `guess`."""
+        """Find keypoints of a known view in another.
+
+        Args:
+            known: the view they are known in.
+            keypoints: (n, 2) where.
+            descriptors: (n, D) how they look.
+            view: where they are looked for.
+            guess: (n, 2) where each is expected.
+            warp: (n, 2, 2) how its patch is expected to deform (`facing_warp`).
+
+        Returns:
+            (n, 2) pixels, and (n,) whether each was found.
+        """
         ...
 
     def extend(
@@ -146,16 +204,15 @@ class FlowAssociation:
 
     def find(
         self,
-        reference: Reference,
+        known: View,
+        keypoints: NDArray[np.float64],
+        descriptors: NDArray[np.uint8],
         view: View,
-        rows: NDArray[np.int64],
         guess: NDArray[np.float64],
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Align the reference's patches."""
-        flow = track(
-            reference.view.pyramid, view.pyramid, reference.keypoints[rows], guess, self.flow, warp
-        )
+        """Align the patches around the keypoints."""
+        flow = track(known.pyramid, view.pyramid, keypoints, guess, self.flow, warp)
         return flow.points, flow.found
 
     def extend(
@@ -187,15 +244,16 @@ class DescriptorAssociation:
 
     def find(
         self,
-        reference: Reference,
+        known: View,
+        keypoints: NDArray[np.float64],
+        descriptors: NDArray[np.uint8],
         view: View,
-        rows: NDArray[np.int64],
         guess: NDArray[np.float64],
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Match the reference's descriptors near the guesses."""
+        """Match the descriptors near the guesses."""
         matches = match_guided(
-            reference.descriptors[rows],
+            descriptors,
             guess,
             view.descriptors,
             view.corners.keypoints,

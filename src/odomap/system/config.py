@@ -12,20 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.bundle import BundleConfig
-from odomap.errors import ConfigError, nearest_name
+from odomap.errors import CalibrationError, ConfigError, nearest_name
+from odomap.sensors.rig import Rig
 from odomap.system.association import (
     Association,
     DescriptorAssociation,
     FlowAssociation,
     TrackingConfig,
 )
+from odomap.system.candidates import CandidateConfig
 from odomap.system.mapping import WindowConfig
+from odomap.system.uncertainty import NoiseConfig
+from odomap.vision.bootstrap import BootstrapConfig
+from odomap.vision.depth import DepthConfig
 from odomap.vision.features import FeatureConfig
 from odomap.vision.flow import FlowConfig
 from odomap.vision.matching import MatchConfig
-from odomap.vision.stereo import StereoConfig, StereoNoise
+from odomap.vision.stereo import StereoConfig
 
-__all__ = ["PRESETS", "Config", "make_association", "preset"]
+__all__ = ["PRESETS", "Config", "make_association", "preset", "preset_for"]
 
 
 @dataclass(frozen=True)
@@ -46,8 +51,27 @@ class Config:
     """The window of keyframes adjusted together."""
     bundle: BundleConfig = field(default_factory=BundleConfig)
     """How a bundle is solved."""
-    noise: StereoNoise = field(default_factory=StereoNoise)
-    """Standard deviations of what is measured in the images."""
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    """What a depth sensor knows."""
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    """How corners without depth become landmarks."""
+    bootstrap: BootstrapConfig = field(default_factory=BootstrapConfig)
+    """When two views of one camera are enough to start."""
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    """How far what is measured may be off."""
+
+
+def _mono() -> Config:
+    return Config(
+        features=FeatureConfig(count=500),
+        tracking=TrackingConfig(sensors="mono"),
+        candidates=CandidateConfig(follow=True),
+        bundle=BundleConfig(iterations=8),
+    )
+
+
+def _rgbd() -> Config:
+    return Config(tracking=TrackingConfig(sensors="rgbd"), candidates=CandidateConfig(follow=True))
 
 
 def _stereo() -> Config:
@@ -62,9 +86,9 @@ def _stereo_orb() -> Config:
 
 
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
-    {"stereo": _stereo, "stereo-orb": _stereo_orb}
+    {"stereo": _stereo, "stereo-orb": _stereo_orb, "mono": _mono, "rgbd": _rgbd}
 )
-"""Named configurations: stereo (optical flow, the default) and stereo-orb (descriptors)."""
+"""Named configurations: stereo, mono and rgbd (optical flow), and stereo-orb (descriptors)."""
 
 
 def preset(name: str) -> Config:
@@ -82,6 +106,19 @@ def preset(name: str) -> Config:
             f"preset '{name}' is unknown{nearest_name(name, PRESETS)}; there are: {known}"
         )
     return PRESETS[name]()
+
+
+def preset_for(rig: Rig) -> str:
+    """Return the preset for what a rig carries: rgbd, stereo or mono.
+
+    Raises:
+        CalibrationError: it has no camera.
+    """
+    if not rig.cameras:
+        raise CalibrationError("this rig has no camera: odometry needs one")
+    if rig.depth is not None:
+        return "rgbd"
+    return "stereo" if len(rig.cameras) > 1 else "mono"
 
 
 def make_association(config: Config, mask: NDArray[np.bool_]) -> Association:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.maps.map import Map
-from odomap.system.association import Reference, View
+from odomap.system.association import View
 from odomap.vision.flow import FlowConfig, facing_warp
 from odomap.vision.patches import align_patches
 
@@ -56,27 +56,33 @@ class FirstSights:
             del self._views[old]
 
     def align(
-        self, view: View, T_world_body: Array, reference: Reference, rows: Index, pixels: Array
+        self,
+        view: View,
+        T_world_body: Array,
+        points_world: Array,
+        first_keyframe: Index,
+        first_keypoint: Array,
+        pixels: Array,
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Locate points of a view against their first sights.
 
         Args:
             view: the image.
             T_world_body: (4, 4) its pose.
-            reference: the keyframe they were tracked from.
-            rows: (n,) rows of the reference.
+            points_world: (n, 3) the points, as far as known.
+            first_keyframe: (n,) keyframe each was first seen in.
+            first_keypoint: (n, 2) where in its image.
             pixels: (n, 2) where they were tracked to.
 
         Returns:
             (n, 2) pixels, and (n,) whether each still goes back to its first sight.
         """
-        points = self._map.points_world(reference.landmark_ids[rows])
         T_world_camera = T_world_body @ self._T_body_camera
-        points_camera = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-        keyframes, which = np.unique(reference.first_keyframe[rows], return_inverse=True)
+        points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        keyframes, which = np.unique(first_keyframe, return_inverse=True)
         Ts_world_first = self._map.Ts_world_body(keyframes) @ self._T_body_camera
         warp = facing_warp(points_camera, (se3_inverse(Ts_world_first) @ T_world_camera)[which])
-        aligned, correlation = np.array(pixels), np.zeros(len(rows))
+        aligned, correlation = np.array(pixels), np.zeros(len(pixels))
         for k, keyframe_id in enumerate(keyframes.tolist()):
             first, of = self._views.get(keyframe_id), np.flatnonzero(which == k)
             if first is None:
@@ -84,7 +90,7 @@ class FirstSights:
             found = align_patches(
                 first.image,
                 view.image,
-                reference.first_keypoint[rows[of]],
+                first_keypoint[of],
                 pixels[of],
                 warp[of],
                 self._flow.half_window_px,

@@ -1,8 +1,9 @@
-"""Making stereo keyframes: depth for what is tracked, new landmarks where nothing is.
+"""Making keyframes: depth for what is tracked, new landmarks where nothing is.
 
 The points tracked into the image keep their landmarks; corners are detected in the gaps between
-them. Stereo measures the disparity of both: near the expected one for tracked points, over the
-whole range for new ones. New points with a disparity become landmarks.
+them. Where the rig measures depth (`ranging`), points have it at once, and new ones with depth
+become landmarks. Those without are followed until their parallax tells it (`candidates`), which is
+all there is for a single camera.
 
 Reference: Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017, section III-A.
 """
@@ -12,84 +13,133 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import CalibrationError
+from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.association import Association, Reference, View
+from odomap.sensors.frame import Frame
+from odomap.system.association import Association, Candidates, Reference, View
+from odomap.system.candidates import Followed, Follower
 from odomap.system.config import Config
+from odomap.system.eye import Eye
 from odomap.system.firstsight import FirstSights
+from odomap.system.ranging import Ranger
 from odomap.vision.features import Features
-from odomap.vision.rectifier import Rectifier
-from odomap.vision.stereo import match_sparse, sgbm_disparity
 
-__all__ = ["Seen", "StereoKeyframes"]
+__all__ = ["Keyframes", "Seen"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Image = NDArray[np.uint8]
-
-MIN_DISPARITY_PX = 0.05
-"""Below this a point is at infinity as far as the pair can tell, and has no depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a view that may become a keyframe shows.
+    """What a view that may become a keyframe shows: rows of its features, in this order.
 
     Attributes:
-        features: of the n points tracked into it, then of new ones, which all have depth.
+        features: of the n tracked points, the c candidates, then what is new.
         landmark_ids: (n,) of the tracked points.
         pixels: (n, 2) where they are.
+        is_ranged: (n,) whether their depth was measured once.
         first: (n,) keyframe each was first seen in, −1 for here.
         first_at: (n, 2) where in its image.
+        followed: the candidates.
     """
 
     features: Features
     landmark_ids: Index
     pixels: Array
+    is_ranged: NDArray[np.bool_]
     first: Index
     first_at: Array
+    followed: Followed
 
 
-class StereoKeyframes:
-    """Turns views into keyframes of a map."""
+class Keyframes:
+    """Turns views into keyframes of a map.
+
+    Args:
+        map: where they go.
+        eye: the camera.
+        ranger: measures depth; None for a single camera.
+        association: how points are found.
+        config: all sections.
+    """
 
     def __init__(
-        self, map: Map, rectifier: Rectifier, association: Association, config: Config
+        self, map: Map, eye: Eye, ranger: Ranger | None, association: Association, config: Config
     ) -> None:
-        self._map, self._rectifier = map, rectifier
+        self._map, self._eye, self.ranger = map, eye, ranger
         self._association, self._config = association, config
-        self._sights = FirstSights(
-            map,
-            rectifier.camera,
-            rectifier.T_body_camera,
-            config.flow,
-            config.window.size + config.window.fixed,
+        keep = config.window.size + config.window.fixed
+        self._sights = (
+            FirstSights(map, eye.camera, eye.T_body_camera, config.flow, keep)
+            if config.tracking.association == "flow"
+            else None
         )
+        self._follower = Follower(
+            map, eye.camera, eye.T_body_camera, association, self._sights, config.candidates
+        )
+
+    def missing(self, frame: Frame) -> str:
+        """Say what a frame lacks to become a keyframe; empty if it has all."""
+        return "" if self.ranger is None else self.ranger.missing(frame)
+
+    def begin(self, frame: Frame, view: View) -> Seen:
+        """Find the points of a view that nothing was tracked into, without touching the map."""
+        none = np.empty(0, np.int64)
+        features = self._features(frame, view, np.empty((0, 2)), self._nothing(), np.empty(0))
+        at, ranged = np.empty((0, 2)), np.empty(0, np.bool_)
+        return Seen(features, none, at, ranged, none, at, self._nothing())
+
+    def seen_first(self, view: View, pixels: Array, points_world: Array) -> Seen:
+        """Return the corners of a first view whose points are known from a second.
+
+        Args:
+            view: the first one.
+            pixels: (c, 2) corners of it.
+            points_world: (c, 3), NaN where not known yet.
+        """
+        none, at, ranged = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.bool_)
+        never = np.full((len(pixels), self._config.candidates.views), -1)
+        descriptors = self._association.descriptors_at(view, pixels)
+        followed = Followed(
+            pixels, points_world, Candidates(pixels, descriptors, pixels, never, never)
+        )
+        features = Features(
+            pixels.astype(np.float32),
+            descriptors,
+            self._eye.camera.unproject(pixels),
+            np.full(len(pixels), np.nan),
+            np.zeros(len(pixels), np.uint8),
+        )
+        return Seen(features, none, at, ranged, none, at, followed)
 
     def measure(
         self,
+        frame: Frame,
         view: View,
-        right: Image,
         T_world_body: Array,
-        tracked: Reference | None,
+        tracked: Reference,
         rows: Index,
         pixels: Array,
     ) -> Seen:
         """Find the points and depths of a view, without touching the map.
 
         Args:
-            view: the left image.
-            right: the raw right image.
+            frame: as it came.
+            view: its image.
             T_world_body: (4, 4).
-            tracked: the keyframe it was tracked from, None for the first.
+            tracked: the keyframe it was tracked from.
             rows: (n,) rows of that keyframe found in the view.
             pixels: (n, 2) where.
         """
-        ids = np.empty(0, np.int64) if tracked is None else tracked.landmark_ids[rows]
+        ids = tracked.landmark_ids[rows]
         pixels, first, first_at = self._first(view, T_world_body, tracked, rows, pixels)
-        expected = self._expected_disparity(T_world_body, ids)
-        return Seen(self._features(view, right, pixels, expected), ids, pixels, first, first_at)
+        follow = self._config.candidates.follow
+        followed = self._follower.follow(tracked, view, T_world_body) if follow else self._nothing()
+        expected = 1.0 / np.maximum(self._depth(T_world_body, ids), 1e-3)
+        features = self._features(frame, view, pixels, followed, expected)
+        return Seen(features, ids, pixels, tracked.is_ranged[rows], first, first_at, followed)
 
     def add(
         self, view: View, T_world_body: Array, seen: Seen, parent: int, covariance: Array
@@ -97,7 +147,7 @@ class StereoKeyframes:
         """Add a keyframe with its landmarks and observations to the map.
 
         Args:
-            view: the left image.
+            view: the image.
             T_world_body: (4, 4).
             seen: what was measured in it.
             parent: the keyframe it was tracked from, −1 for the first.
@@ -106,31 +156,46 @@ class StereoKeyframes:
         Returns:
             The keyframe as the tracker needs it.
         """
-        features, pixels, first = seen.features, seen.pixels, seen.first
-        keyframe_id, n = self._map.new_keyframe_id(), len(pixels)
+        features, followed = seen.features, seen.followed
+        keyframe_id, n, c = self._map.new_keyframe_id(), len(seen.pixels), len(followed.pixels)
         self._map.add_keyframe(
             Keyframe(keyframe_id, view.stamp_ns, features),
             T_world_body,
             parent=parent,
             covariance=covariance,
         )
-        bearings, T = features.bearings[n:], self._rectifier.T_body_camera
-        points_camera = bearings / bearings[:, 2:] * features.depth[n:, None]
-        new = self._map.add_landmarks(keyframe_id, points_camera @ T[:3, :3].T + T[:3, 3])
-        self._sights.remember(keyframe_id, view)
+        if self._sights is not None:
+            self._sights.remember(keyframe_id, view)
+        # A measured depth comes before a triangulated one.
+        bearings, T = features.bearings[n:], self._eye.T_body_camera
+        local = bearings / bearings[:, 2:] * features.depth[n:, None]
+        points_body = local @ T[:3, :3].T + T[:3, 3]
+        ranged = np.isfinite(features.depth[n:])
+        T_body_world = se3_inverse(T_world_body)
+        triangulated = followed.points_world @ T_body_world[:3, :3].T + T_body_world[:3, 3]
+        points_body[:c] = np.where(ranged[:c, None], points_body[:c], triangulated)
+        placed = np.flatnonzero(np.isfinite(points_body[:, 0]))
+        new = self._map.add_landmarks(keyframe_id, points_body[placed])
         ids = np.concatenate([seen.landmark_ids, new])
-        self._map.add_observations(keyframe_id, ids, np.arange(len(ids)))
-        keypoints = np.concatenate([pixels, features.keypoints[n:].astype(np.float64)])
+        rows = np.concatenate([np.arange(n), n + placed])
+        self._map.add_observations(keyframe_id, ids, rows)
+        history = self._history(keyframe_id, seen)
+        self._observed_before(new, history.at(placed))
+        keypoints = features.keypoints.astype(np.float64)
+        keypoints[:n] = seen.pixels
+        rest = np.setdiff1d(np.arange(len(history)), placed)
         return self._reference(
             keyframe_id,
             view,
             ids,
-            keypoints,
-            features.descriptors,
+            keypoints[rows],
+            features.descriptors[rows],
+            np.concatenate([seen.is_ranged, ranged[placed]]),
             np.concatenate(
-                [np.where(first < 0, keyframe_id, first), np.full(len(new), keyframe_id)]
+                [np.where(seen.first < 0, keyframe_id, seen.first), history.keyframes[placed, 0]]
             ),
-            np.concatenate([seen.first_at, keypoints[n:]]),
+            np.concatenate([seen.first_at, history.first_at[placed]]),
+            history.at(rest) if self._config.candidates.follow else history.at(rest[:0]),
         )
 
     def refreshed(self, reference: Reference) -> Reference:
@@ -142,38 +207,72 @@ class StereoKeyframes:
             r.landmark_ids,
             r.keypoints,
             r.descriptors,
+            r.is_ranged,
             r.first_keyframe,
             r.first_keypoint,
+            r.candidates,
         )
 
-    def _features(self, view: View, right: Image, pixels: Array, expected: Array) -> Features:
-        """Gather the tracked pixels, then new corners with depth, as features."""
-        wanted = self._config.features.count - len(pixels)
-        fresh, described = self._association.extend(view, pixels, wanted)
-        keypoints = np.concatenate([pixels, fresh])
-        disparity = self._disparity(view, right, keypoints, expected)
-        fb = self._rectifier.camera.fx * self._rectifier.baseline
-        depth = fb / np.where(disparity > MIN_DISPARITY_PX, disparity, np.nan)
-        # Keep all that is tracked, and of what is new only what has depth.
-        keep = np.isfinite(depth) | (np.arange(len(depth)) < len(pixels))
-        descriptors = np.concatenate([self._association.descriptors_at(view, pixels), described])
+    def _features(
+        self, frame: Frame, view: View, pixels: Array, followed: Followed, expected: Array
+    ) -> Features:
+        """Gather what is tracked, what is followed, and new corners, as features."""
+        kept = np.concatenate([pixels, followed.pixels])
+        wanted = self._config.features.count - len(kept)
+        fresh, described = self._association.extend(view, kept, max(wanted, 0))
+        keypoints = np.concatenate([kept, fresh])
+        depth = np.full(len(keypoints), np.nan)
+        if self.ranger is not None:
+            depth = 1.0 / self.ranger.measure(frame, view, keypoints, expected)
+        keep = np.isfinite(depth) | (np.arange(len(depth)) < len(kept))
+        if self._config.candidates.follow:
+            keep[:] = True
+        descriptors = np.concatenate([self._association.descriptors_at(view, kept), described])
         return Features(
             keypoints[keep].astype(np.float32),
             descriptors[keep],
-            self._rectifier.camera.unproject(keypoints[keep]),
+            self._eye.camera.unproject(keypoints[keep]),
             depth[keep],
             np.zeros(int(keep.sum()), np.uint8),
         )
 
     def _first(
-        self, view: View, T_world_body: Array, tracked: Reference | None, rows: Index, pixels: Array
+        self, view: View, T_world_body: Array, tracked: Reference, rows: Index, pixels: Array
     ) -> tuple[Array, Index, Array]:
         """Align tracked points to their first sights; −1 for those that start afresh here."""
-        if tracked is None or self._config.tracking.association != "flow":
+        if self._sights is None:
             return pixels, np.full(len(pixels), -1), pixels
-        pixels, kept = self._sights.align(view, T_world_body, tracked, rows, pixels)
-        keyframes = np.where(kept, tracked.first_keyframe[rows], -1)
-        return pixels, keyframes, np.where(kept[:, None], tracked.first_keypoint[rows], pixels)
+        points = self._map.points_world(tracked.landmark_ids[rows])
+        first = tracked.first_keyframe[rows], tracked.first_keypoint[rows]
+        pixels, kept = self._sights.align(view, T_world_body, points, *first, pixels)
+        return pixels, np.where(kept, first[0], -1), np.where(kept[:, None], first[1], pixels)
+
+    def _history(self, keyframe_id: int, seen: Seen) -> Candidates:
+        """Return all rows beyond the tracked ones as candidates, seen in this keyframe too."""
+        n, old = len(seen.pixels), seen.followed.history
+        keypoints = seen.features.keypoints[n:].astype(np.float64)
+        c, views = len(old), self._config.candidates.views
+        keyframes = np.full((len(keypoints), views), -1)
+        rows = np.full((len(keypoints), views), -1)
+        first_at = np.array(keypoints)
+        keyframes[:c], rows[:c] = old.keyframes, old.rows
+        known = keyframes[:, 0] >= 0
+        first_at[:c][known[:c]] = old.first_at[known[:c]]
+        # One that has been followed for long enough starts afresh here.
+        full = keyframes[:, -1] >= 0
+        keyframes[full], rows[full], first_at[full] = -1, -1, keypoints[full]
+        at = np.argmax(keyframes < 0, axis=1)
+        keyframes[np.arange(len(at)), at] = keyframe_id
+        rows[np.arange(len(at)), at] = n + np.arange(len(at))
+        return Candidates(keypoints, seen.features.descriptors[n:], first_at, keyframes, rows)
+
+    def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:
+        """Tell the map which earlier keyframes have seen new landmarks."""
+        for keyframe_id in np.unique(history.keyframes[history.keyframes >= 0]).tolist():
+            if self._map.keyframe(keyframe_id).features is None:
+                continue
+            which, view = np.nonzero(history.keyframes == keyframe_id)
+            self._map.add_observations(keyframe_id, landmark_ids[which], history.rows[which, view])
 
     def _reference(
         self,
@@ -182,64 +281,58 @@ class StereoKeyframes:
         ids: Index,
         keypoints: Array,
         descriptors: NDArray[np.uint8],
+        is_ranged: NDArray[np.bool_],
         first_keyframe: Index,
         first_keypoint: Array,
+        candidates: Candidates,
     ) -> Reference:
         """Add what the map knows now, and leave out landmarks that are gone."""
-        points = self._map.points_world(ids)
-        T = self._map.T_world_body(keyframe_id) @ self._rectifier.T_body_camera
-        depth = (points - T[:3, 3]) @ T[:3, 2]
+        T_world_body = self._map.T_world_body(keyframe_id)
+        depth = self._depth(T_world_body, ids)
         good = np.isfinite(depth) & (depth > 0)
+        relative = self._relative(
+            T_world_body, ids[good], depth[good], is_ranged[good], first_keyframe[good]
+        )
         return Reference(
             keyframe_id,
             view,
             ids[good],
             keypoints[good],
             descriptors[good],
-            self._map.count_observers(ids[good]),
-            depth[good],
+            is_ranged[good],
+            relative,
             first_keyframe[good],
             first_keypoint[good],
+            candidates,
         )
 
-    def _expected_disparity(self, T_world_body: Array, landmark_ids: Index) -> Array:
-        T = T_world_body @ self._rectifier.T_body_camera
-        depth = (self._map.points_world(landmark_ids) - T[:3, 3]) @ T[:3, 2]
-        return np.asarray(
-            self._rectifier.camera.fx * self._rectifier.baseline / np.maximum(depth, 1e-3)
-        )
+    def _relative(
+        self,
+        T_world_body: Array,
+        ids: Index,
+        depth: Array,
+        is_ranged: NDArray[np.bool_],
+        first_keyframe: Index,
+    ) -> Array:
+        """Return (N,) standard deviations of depth as fractions of it."""
+        relative = np.empty(len(ids))
+        if self.ranger is not None:
+            seen = np.maximum(self._map.count_observers(ids), 1)
+            relative[:] = self.ranger.sigma * depth / np.sqrt(seen)
+        far = np.flatnonzero(~is_ranged)
+        if far.size:
+            T, points = self._eye.T_body_camera, self._map.points_world(ids[far])
+            here = points - (T_world_body @ T)[:3, 3]
+            there = points - (self._map.Ts_world_body(first_keyframe[far]) @ T)[:, :3, 3]
+            across = np.linalg.norm(np.cross(here, there), axis=1)
+            parallax = np.arctan2(across, np.sum(here * there, axis=1))
+            sigma = self._config.noise.position_px / self._eye.camera.fx
+            relative[far] = sigma / np.maximum(parallax, 1e-6)
+        return relative
 
-    def _disparity(self, view: View, right: Image, keypoints: Array, expected: Array) -> Array:
-        image = self._rectifier.rectify(right, "right")
-        config = self._config.stereo
-        if config.method == "sgbm":
-            dense = sgbm_disparity(view.image, image, config)
-            columns, rows = np.round(keypoints).astype(np.int64).T
-            rows, columns = rows.clip(0, len(dense) - 1), columns.clip(0, dense.shape[1] - 1)
-            return np.asarray(dense[rows, columns], np.float64)
-        low = np.full(len(keypoints), -2.0)
-        high = np.full(len(keypoints), float(config.max_disparity_px))
-        low[: len(expected)], high[: len(expected)] = expected - 4.0, expected + 4.0
-        return match_sparse(view.image, image, keypoints, config, low, high)
+    def _depth(self, T_world_body: Array, landmark_ids: Index) -> Array:
+        T = T_world_body @ self._eye.T_body_camera
+        return np.asarray((self._map.points_world(landmark_ids) - T[:3, 3]) @ T[:3, 2])
 
-    def check_order(self, view: View, right: Image) -> None:
-        """Raise if the two images match better the other way round.
-
-        Raises:
-            CalibrationError: if left and right are swapped.
-        """
-        image = self._rectifier.rectify(right, "right")
-        points, _ = self._association.extend(view, np.empty((0, 2)), 200)
-        matched = np.isfinite(match_sparse(view.image, image, points, self._config.stereo)).sum()
-        mirrored = match_sparse(
-            np.ascontiguousarray(view.image[:, ::-1]),
-            np.ascontiguousarray(image[:, ::-1]),
-            np.stack([view.image.shape[1] - 1 - points[:, 0], points[:, 1]], axis=1),
-            self._config.stereo,
-        )
-        swapped = int((mirrored > 1.0).sum())
-        if swapped >= 30 and swapped > 2 * matched:
-            raise CalibrationError(
-                f"stereo pair: {swapped} of {len(points)} points have negative disparity, "
-                f"{matched} positive: left and right are swapped, exchange the two cameras"
-            )
+    def _nothing(self) -> Followed:
+        return Followed.none(self._config.candidates.views)

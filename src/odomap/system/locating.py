@@ -17,8 +17,9 @@ from odomap.backend.motion import MotionSolution, Sightings, solve_motion
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.system.association import Association, Reference, View
+from odomap.system.ranging import UNIT_BASELINE
+from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.flow import facing_warp
-from odomap.vision.stereo import StereoNoise
 
 __all__ = ["Located", "Locator"]
 
@@ -58,16 +59,10 @@ class Locator:
         self,
         association: Association,
         camera: Camera,
-        baseline: float,
         T_body_camera: Array,
-        noise: StereoNoise,
+        noise: NoiseConfig,
     ) -> None:
-        self._association, self._camera, self._baseline, self._noise = (
-            association,
-            camera,
-            baseline,
-            noise,
-        )
+        self._association, self._camera, self._noise = association, camera, noise
         self._T_body_camera, self._T_camera_body = T_body_camera, se3_inverse(T_body_camera)
 
     def locate(
@@ -101,7 +96,14 @@ class Locator:
             & self._camera.is_inside(np.nan_to_num(guess, nan=-1.0), 2.0)
         )
         warp = facing_warp(points_camera[rows], T_reference_camera)
-        pixels, found = self._association.find(reference, view, rows, guess[rows], warp)
+        pixels, found = self._association.find(
+            reference.view,
+            reference.keypoints[rows],
+            reference.descriptors[rows],
+            view,
+            guess[rows],
+            warp,
+        )
         rows, pixels = rows[found], pixels[found]
         weights = self._weights(points_camera[rows], T_reference_camera, reference, rows)
         sightings = Sightings(
@@ -119,7 +121,7 @@ class Locator:
         )
 
     def _solve(self, T_world_body: Array, sightings: Sightings) -> MotionSolution:
-        return solve_motion(T_world_body, self._T_camera_body, self._baseline, sightings)
+        return solve_motion(T_world_body, self._T_camera_body, UNIT_BASELINE, sightings)
 
     def _project(self, points_camera: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,14 +151,8 @@ class Locator:
             * np.linalg.norm(ray[:, :2] - points_camera[:, :2] / depth * ray[:, 2:], axis=1)
             / depth[:, 0]
         )
-        disparity = f * self._baseline / np.maximum(reference.depth[rows], 1e-3)
-        relative = (
-            self._noise.disparity_px / disparity / np.sqrt(np.maximum(reference.seen[rows], 1))
-        )
-        sigma = np.hypot(self._noise.position_px, slide * np.minimum(relative, 1.0))
-        return np.asarray(
-            f / np.stack([sigma, np.full(len(sigma), self._noise.disparity_px)], axis=1)
-        )
+        sigma = np.hypot(self._noise.position_px, slide * np.minimum(reference.relative[rows], 1.0))
+        return np.stack([f / sigma, np.ones(len(sigma))], axis=1)
 
 
 def _variance_factor(solution: MotionSolution) -> float:

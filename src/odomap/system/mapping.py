@@ -21,9 +21,9 @@ from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
+from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.stages import Loop
-from odomap.system.uncertainty import Calibration, Drift
-from odomap.vision.stereo import StereoNoise
+from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
 
 __all__ = ["WindowChange", "WindowConfig", "WindowJob", "WindowMapper"]
 
@@ -47,9 +47,11 @@ class WindowMapper:
 
     Args:
         map: where keyframes and landmarks are.
-        T_body_camera: (4, 4) mount of the rectified left camera.
-        camera: the rectified camera.
-        baseline: metres.
+        T_body_camera: (4, 4) mount of the pinhole.
+        camera: the pinhole.
+        window, bundle, noise: sections of the configuration.
+        sigma: standard deviation of a measured inverse depth, 1/m.
+        calibration: how far all of them may be off together, 1/m.
     """
 
     def __init__(
@@ -57,25 +59,30 @@ class WindowMapper:
         map: Map,
         T_body_camera: Array,
         camera: Camera,
-        baseline: float,
         window: WindowConfig,
         bundle: BundleConfig,
-        noise: StereoNoise,
+        noise: NoiseConfig,
+        sigma: float = 1.0,
+        calibration: float = 0.0,
     ) -> None:
         self._map, self._window, self._bundle, self._noise = map, window, bundle, noise
         self._T_camera_body = se3_inverse(T_body_camera)
-        self._focal, self._baseline = camera.fx, baseline
-        self._calibration = Calibration.of(noise, camera, T_body_camera)
+        self._weights = np.array([camera.fx / noise.position_px, 1.0 / sigma])
+        self._calibration = Calibration.of(noise, camera, T_body_camera, calibration)
         self._recent: list[int] = []
         self._drifts: dict[int, Drift] = {}
 
     def add(self, keyframe: Keyframe) -> "WindowJob | None":
         """Take in a keyframe that is in the map, and read the window that it ends."""
         size, fixed = self._window.size, self._window.fixed
-        leaving = self._recent[: -(size + fixed - 1)]
-        if not len(self._map.covisible(keyframe.id)[0]):
-            leaving = self._recent  # odometry has started anew: nothing ties the window to it
-        self._recent = [*self._recent[len(leaving) :], keyframe.id]
+        tied = np.sort(self._map.covisible(keyframe.id)[0]).tolist()
+        # Odometry that starts anew has no tie to the window, and may make two keyframes at once.
+        leaving = (
+            self._recent[: -(size + fixed - 1)] if set(tied) & set(self._recent) else self._recent
+        )
+        kept = self._recent[len(leaving) :]
+        together = [k for k in tied if not self._recent or k > self._recent[-1]]
+        self._recent = [*kept, *together, keyframe.id]
         if len(self._recent) < 2:
             self._map.retire_keyframes(leaving)
             return None
@@ -113,7 +120,7 @@ class WindowMapper:
     def _make_bundle(self, snapshot: Snapshot) -> Bundle:
         """Gather what the keyframes measured, in the order of the snapshot's observations."""
         xy = np.empty((len(snapshot.obs_keyframe), 2))
-        disparity = np.full(len(xy), np.nan)
+        inverse_depth = np.full(len(xy), np.nan)
         for k, keyframe in enumerate(snapshot.keyframes):
             rows = np.flatnonzero(snapshot.obs_keyframe == k)
             if not rows.size or keyframe.features is None:
@@ -121,21 +128,23 @@ class WindowMapper:
             seen = snapshot.obs_keypoint[rows]
             bearings = keyframe.features.bearings[seen]
             xy[rows] = bearings[:, :2] / bearings[:, 2:]
-            disparity[rows] = self._baseline / keyframe.features.depth[seen]
-        sigma = np.array([self._noise.position_px, self._noise.disparity_px])
+            inverse_depth[rows] = 1.0 / keyframe.features.depth[seen]
         zeros = np.zeros(len(xy), np.int64)
         return Bundle(
             snapshot.Ts_world_body,
             snapshot.is_fixed,
             snapshot.points_world,
             self._T_camera_body[None],
-            np.array([self._baseline]),
+            np.array([UNIT_BASELINE]),
             snapshot.obs_keyframe,
             snapshot.obs_landmark,
             zeros,
             xy,
-            disparity,
-            np.tile(self._focal / sigma, (len(xy), 1)),
+            inverse_depth,
+            np.tile(self._weights, (len(xy), 1)),
+            is_scale_free=bool(
+                snapshot.is_fixed.sum() == 1 and not np.isfinite(inverse_depth).any()
+            ),
         )
 
 

@@ -46,7 +46,7 @@ class Path:
     def __init__(self, map: Map) -> None:
         self._map = map
         self._frames: list[Placed] = []
-        self._live: list[tuple[Array, Array]] = []
+        self._live: list[tuple[int, Array, Array]] = []
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -59,8 +59,13 @@ class Path:
     def append(self, frame: Placed) -> tuple[Array, Array]:
         """Add a frame; return its pose (4, 4) and covariance (6, 6) in the world as known now."""
         self._frames.append(frame)
-        self._live.append((self._pose(frame), self.covariance(frame)))
-        return self._live[-1]
+        T_world_body, covariance = self._pose(frame), self.covariance(frame)
+        self._live.append((frame.stamp_ns, T_world_body, covariance))
+        return T_world_body, covariance
+
+    def append_late(self, frame: Placed) -> None:
+        """Add a frame that could not be placed when it came; it is no part of the live path."""
+        self._frames.append(frame)
 
     def last_pose(self) -> Array:
         """Return the last frame's T_world_body (4, 4) as known now; identity if there is none."""
@@ -87,18 +92,23 @@ class Path:
 
     def trajectory(self) -> Trajectory:
         """Return T_world_body of all frames as known now, with covariances."""
-        poses = [self._pose(frame) for frame in self._frames]
-        covariances = [self.covariance(frame) for frame in self._frames]
-        return self._trajectory(poses, covariances)
+        return _trajectory([(f.stamp_ns, self._pose(f), self.covariance(f)) for f in self._frames])
+
+    def keyframes(self) -> Trajectory:
+        """Return the keyframes among the frames, as known now."""
+        keyframes = [f for f in self._frames if np.array_equal(f.T_keyframe_body, np.eye(4))]
+        rows = [(f.stamp_ns, self._pose(f), self.covariance(f)) for f in keyframes]
+        return _trajectory(rows)
 
     def trajectory_live(self) -> Trajectory:
-        """Return the same frames as they were when added."""
-        return self._trajectory([T for T, _ in self._live], [c for _, c in self._live])
-
-    def _trajectory(self, poses: list[Array], covariances: list[Array]) -> Trajectory:
-        stamps = np.array([frame.stamp_ns for frame in self._frames], np.int64)
-        Ts = np.array(poses).reshape(-1, 4, 4)
-        return Trajectory(stamps, Ts, np.array(covariances).reshape(-1, 6, 6))
+        """Return the frames placed at once, as they were then."""
+        return _trajectory(self._live)
 
     def _pose(self, frame: Placed) -> Array:
         return self._map.place(frame.keyframe_id, frame.T_keyframe_body)
+
+
+def _trajectory(rows: list[tuple[int, Array, Array]]) -> Trajectory:
+    stamps = np.array([stamp for stamp, _, _ in rows], np.int64)
+    Ts = np.array([T for _, T, _ in rows]).reshape(-1, 4, 4)
+    return Trajectory(stamps, Ts, np.array([c for _, _, c in rows]).reshape(-1, 6, 6))

@@ -1,18 +1,20 @@
-"""Tracking with a stereo pair: the stage that places every frame and makes the keyframes.
+"""Tracking: the stage that places every frame and makes the keyframes, whatever the camera.
 
 A frame is placed against the landmarks of the last keyframe (`locating`). When the view has changed
-enough it becomes a keyframe itself: new corners fill the gaps between the tracked ones, and stereo
-gives all of them depth (`keyframing`).
+enough it becomes a keyframe itself (`keyframing`). How the first keyframes come about is all that
+differs between a camera with depth and one without (`starting`).
 
 When too few landmarks agree with a pose the frame is lost, and says so. It is tried from where it
-is expected, from where it was, and by descriptors (`relocalization`); if that fails for some
-frames, tracking starts anew where it was last, with a covariance that admits it.
+is expected, from how the image turned, from where it was, and by descriptors (`relocalization`);
+if that fails for some frames, tracking starts anew where it was last, with a covariance that
+admits it.
 
 Reference: Nistér, Naroditsky, Bergen, "Visual Odometry", CVPR 2004; Mur-Artal, Tardós, "ORB-SLAM2",
 T-RO 2017 (stereo keyframes).
 """
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,19 +25,19 @@ from odomap.geometry.pose import SE3
 from odomap.maps.estimate import Estimate, Status, Tracks
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
-from odomap.sensors.rig import Rig
 from odomap.system.association import Association, Reference, View
-from odomap.system.config import Config, make_association
-from odomap.system.keyframing import StereoKeyframes
+from odomap.system.config import Config
+from odomap.system.eye import Eye
+from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located, Locator
 from odomap.system.path import Path, Placed
 from odomap.system.relocalization import relocalize
-from odomap.vision.rectifier import Rectifier
+from odomap.system.starting import Start, Waiting
+from odomap.vision.turning import Thumbnail, turn_between
 
-__all__ = ["StereoTracker"]
+__all__ = ["Tracker"]
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 
 class _Clock:
@@ -52,39 +54,40 @@ class _Clock:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pair:
-    """A frame being tracked: its left view, its raw right image, and the clock."""
+class _Look:
+    """A frame being tracked: its ideal view, and the clock."""
 
     frame: Frame
     view: View
-    right: Image | None
     clock: _Clock
 
 
-class StereoTracker:
-    """Places the frames of a stereo pair in a map.
+class Tracker:
+    """Places the frames of a camera in a map.
 
     Args:
-        rig: with two cameras.
-        config: all sections.
         map: where keyframes go.
-        rectifier: of the rig's pair.
+        eye: the camera.
+        association: finds landmarks in images.
+        keyframes: makes keyframes.
+        start: makes the first ones.
+        config: all sections.
     """
 
-    def __init__(self, rig: Rig, config: Config, map: Map, rectifier: Rectifier) -> None:
-        left, right = rig.stereo_pair()
-        self._left, self._right = rig.cameras.index(left), rig.cameras.index(right)
-        self._config, self._map, self._rectifier = config, map, rectifier
-        self._association: Association = make_association(config, rectifier.mask)
-        self._locator = Locator(
-            self._association,
-            rectifier.camera,
-            rectifier.baseline,
-            rectifier.T_body_camera,
-            config.noise,
-        )
-        self._keyframes = StereoKeyframes(map, rectifier, self._association, config)
+    def __init__(
+        self,
+        map: Map,
+        eye: Eye,
+        association: Association,
+        keyframes: Keyframes,
+        start: Start,
+        config: Config,
+    ) -> None:
+        self._map, self._eye, self._association = map, eye, association
+        self._keyframes, self._start, self._config = keyframes, start, config
+        self._locator = Locator(association, eye.camera, eye.T_body_camera, config.noise)
         self._reference: Reference | None = None
+        self._last: View | None = None
         self._epoch = map.epoch
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = 0
@@ -92,79 +95,77 @@ class StereoTracker:
     def track(self, frame: Frame) -> Estimate:
         """Place one frame; its keyframe, if it became one, is in the map when this returns."""
         clock = _Clock()
-        left, right = (
-            frame.images[i] if i < len(frame.images) else None for i in (self._left, self._right)
-        )
-        if left is None:
-            return self._lose(frame, "the left image is missing", clock)
-        image = self._rectifier.rectify(left, "left")
-        pair = _Pair(frame, self._association.view(frame.id, frame.stamp_ns, image), right, clock)
+        image = self._eye.image(frame)
+        if image is None:
+            return self._lose(frame, f"the {self._eye.name} image is missing", clock)
+        look = _Look(frame, self._association.view(frame.id, frame.stamp_ns, image), clock)
         clock.lap("prepare")
         reference = self._current_reference()
         if reference is None:
-            return self._begin(pair)
-        located, status = self._locate(pair.view, reference)
+            return self._begin(look)
+        located, status = self._locate(look.view, reference)
         clock.lap("track")
         if located.num_inliers >= self._config.tracking.min_inliers:
-            return self._accept(pair, reference, located, status)
+            return self._accept(look, reference, located, status)
         if self._lost >= self._config.tracking.patience:
-            return self._begin(pair)
-        reason = _why_lost(located, self._config.tracking.min_inliers, pair.view)
+            return self._begin(look)
+        reason = _why_lost(located, self._config.tracking.min_inliers, look.view)
         return self._lose(frame, reason, clock)
 
     # ---- the three ways a frame can go ----
 
-    def _begin(self, pair: _Pair) -> Estimate:
-        """Start, or start anew after a loss, with a keyframe made from this pair alone."""
-        frame = pair.frame
-        if pair.right is None:
-            return self._lose(frame, "the right image is missing: cannot start", pair.clock)
+    def _begin(self, look: _Look) -> Estimate:
+        """Start, or start anew after a loss."""
+        frame, anew = look.frame, len(self.path) > 0
         T_world_body, covariance = self.path.last_pose(), self._gap_covariance(frame.stamp_ns)
-        none = np.empty(0, np.int64)
-        self._keyframes.check_order(pair.view, pair.right)
-        seen = self._keyframes.measure(
-            pair.view, pair.right, T_world_body, None, none, np.empty((0, 2))
+        started = self._start.begin(frame, look.view, T_world_body, covariance)
+        look.clock.lap("keyframe")
+        if isinstance(started, Waiting):
+            return self._lose(frame, started.reason, look.clock)
+        self._reference, self._since_keyframe, self._lost = started.reference, 0, 0
+        self._first_count, self._epoch = started.count, self._map.epoch
+        self._last = look.view
+        for placed in started.placed[:-1]:
+            self.path.append_late(placed)
+        return self._estimate(
+            look,
+            Status.INITIALIZING if anew else Status.TRACKING,
+            self._start.anew if anew else "",
+            started.placed[-1],
+            started.count,
+            True,
+            None,
         )
-        count, needed = len(seen.features), 2 * self._config.tracking.min_inliers
-        pair.clock.lap("keyframe")
-        if count < needed:
-            why = f"{count} points with depth of {needed} needed to start"
-            return self._lose(frame, f"{why}: too dark or no texture?", pair.clock)
-        made = self._keyframes.add(pair.view, T_world_body, seen, -1, covariance)
-        anew = len(self.path) > 0
-        self._reference, self._since_keyframe, self._lost = made, 0, 0
-        self._first_count, self._epoch = count, self._map.epoch
-        reason = "started anew where it was last: how it moved since is not known" if anew else ""
-        placed = Placed(frame.stamp_ns, made.keyframe_id, np.eye(4), np.zeros((6, 6)))
-        status = Status.INITIALIZING if anew else Status.TRACKING
-        return self._estimate(pair, status, reason, placed, count, True, None)
 
     def _accept(
-        self, pair: _Pair, reference: Reference, located: Located, status: Status
+        self, look: _Look, reference: Reference, located: Located, status: Status
     ) -> Estimate:
         """Turn a placed view into an estimate, and into a keyframe if it is time for one."""
-        self._lost = 0
+        if self._lost:
+            self._start.forget()
+        self._lost, self._last = 0, look.view
         self._since_keyframe += 1
         if self._since_keyframe == 1:
             self._first_count = located.num_inliers
         T_world_reference = self._map.T_world_body(reference.keyframe_id)
         placed = Placed(
-            pair.frame.stamp_ns,
+            look.frame.stamp_ns,
             reference.keyframe_id,
             se3_inverse(T_world_reference) @ located.T_world_body,
             located.covariance,
         )
         tracks = Tracks(
-            self._rectifier.to_raw(located.pixels).astype(np.float32),
-            self._rectifier.to_raw(reference.keypoints[located.rows]).astype(np.float32),
+            self._eye.to_raw(located.pixels).astype(np.float32),
+            self._eye.to_raw(reference.keypoints[located.rows]).astype(np.float32),
             located.inliers,
         )
-        wanted = self._wants_keyframe(reference, located)
-        reason = "the right image is missing: no keyframe" if wanted and pair.right is None else ""
-        if wanted and pair.right is not None:
-            placed = self._add_keyframe(pair, pair.right, reference, located, placed)
+        reason, is_keyframe = "", self._wants_keyframe(reference, located)
+        if is_keyframe and (missing := self._keyframes.missing(look.frame)):
+            reason, is_keyframe = f"{missing}: no keyframe", False
+        if is_keyframe:
+            placed = self._add_keyframe(look, reference, located, placed)
         return self._estimate(
-            pair, status, reason, placed, located.num_inliers, wanted and not reason, tracks
+            look, status, reason, placed, located.num_inliers, is_keyframe, tracks
         )
 
     def _lose(self, frame: Frame, reason: str, clock: _Clock) -> Estimate:
@@ -186,7 +187,7 @@ class StereoTracker:
 
     def _estimate(
         self,
-        pair: _Pair,
+        look: _Look,
         status: Status,
         reason: str,
         placed: Placed,
@@ -196,8 +197,8 @@ class StereoTracker:
     ) -> Estimate:
         T_world_body, covariance = self.path.append(placed)
         return Estimate(
-            pair.frame.id,
-            pair.frame.stamp_ns,
+            look.frame.id,
+            look.frame.stamp_ns,
             status,
             reason,
             placed.keyframe_id,
@@ -206,7 +207,7 @@ class StereoTracker:
             covariance,
             num_inliers,
             is_keyframe,
-            pair.clock.laps,
+            look.clock.laps,
             tracks,
         )
 
@@ -220,7 +221,7 @@ class StereoTracker:
         return self._reference
 
     def _locate(self, view: View, reference: Reference) -> tuple[Located, Status]:
-        """Try the predicted motion, then none, then descriptors."""
+        """Try the motions that are likely, then descriptors."""
         config = self._config.tracking
         points = self._map.points_world(reference.landmark_ids)
         T_reference = self._map.T_world_body(reference.keyframe_id)
@@ -229,7 +230,7 @@ class StereoTracker:
         enough = max(config.min_inliers, 0.3 * self._first_count)
         dt = min((view.stamp_ns - self.path.last.stamp_ns) * 1e-9, config.max_prediction_s)
         best: Located | None = None
-        for motion in (se3_exp(self.path.velocity() * dt), np.eye(4)):
+        for motion in self._motions(view, dt):
             located = self._locator.locate(view, reference, points, T_reference, T_last @ motion)
             if located.num_inliers >= enough:
                 return located, tracked
@@ -239,18 +240,38 @@ class StereoTracker:
             view,
             reference,
             points,
-            self._rectifier.camera,
+            self._eye.camera,
             self._config.features,
             self._config.matching,
-            self._rectifier.mask,
+            self._eye.mask,
             config.min_inliers,
         )
         if T_world_camera is not None:
-            T_guess = T_world_camera @ se3_inverse(self._rectifier.T_body_camera)
+            T_guess = T_world_camera @ se3_inverse(self._eye.T_body_camera)
             located = self._locator.locate(view, reference, points, T_reference, T_guess)
             if located.num_inliers > best.num_inliers:
                 return located, Status.RECOVERED
         return best, tracked
+
+    def _motions(self, view: View, dt: float) -> Iterator[Array]:
+        """Yield how the body may have moved: steadily, as the images turned, not at all."""
+        steady = se3_exp(self.path.velocity() * dt)
+        yield steady
+        R = self._turn(view)
+        if R is not None:
+            mount = self._eye.T_body_camera
+            turned = np.eye(4)
+            turned[:3, :3] = mount[:3, :3] @ R @ mount[:3, :3].T
+            turned[:3, 3] = steady[:3, 3]
+            yield turned
+        yield np.eye(4)
+
+    def _turn(self, view: View) -> Array | None:
+        """Return R_before_now (3, 3) of the camera since the last frame placed."""
+        if self._last is None:
+            return None
+        now = Thumbnail.of(view.pyramid[-1], self._eye.camera)
+        return turn_between(Thumbnail.of(self._last.pyramid[-1], self._eye.camera), now)
 
     def _wants_keyframe(self, reference: Reference, located: Located) -> bool:
         config = self._config.tracking
@@ -259,27 +280,21 @@ class StereoTracker:
         return bool(
             self._since_keyframe >= config.keyframe_interval
             or located.num_inliers < config.keyframe_ratio * self._first_count
-            or motion > config.keyframe_motion * self._rectifier.camera.width
+            or motion > config.keyframe_motion * self._eye.camera.width
         )
 
     def _add_keyframe(
-        self, pair: _Pair, right: Image, reference: Reference, located: Located, placed: Placed
+        self, look: _Look, reference: Reference, located: Located, placed: Placed
     ) -> Placed:
         """Make the frame a keyframe; the mapper will know its pose better."""
         T_world_body, inliers = located.T_world_body, located.inliers
-        seen = self._keyframes.measure(
-            pair.view,
-            right,
-            T_world_body,
-            reference,
-            located.rows[inliers],
-            located.pixels[inliers],
-        )
+        rows, pixels = located.rows[inliers], located.pixels[inliers]
+        seen = self._keyframes.measure(look.frame, look.view, T_world_body, reference, rows, pixels)
         self._reference = self._keyframes.add(
-            pair.view, T_world_body, seen, reference.keyframe_id, self.path.covariance(placed)
+            look.view, T_world_body, seen, reference.keyframe_id, self.path.covariance(placed)
         )
         self._since_keyframe = 0
-        pair.clock.lap("keyframe")
+        look.clock.lap("keyframe")
         return Placed(placed.stamp_ns, self._reference.keyframe_id, np.eye(4), np.zeros((6, 6)))
 
     def _gap_covariance(self, stamp_ns: int) -> Array:

@@ -9,8 +9,8 @@ Spans of one window each are chained, not neighbouring keyframes: consecutive st
 landmarks and so their errors, which a sum over every step would count again and again. f is the
 variance factor found in the residuals times a factor for errors that observations share.
 
-Calibration. No amount of data averages out what the rig says wrongly. An error δ of all
-disparities, an offset or a slope across the image, moves the newest keyframe by k_k (the solver's
+Calibration. No amount of data averages out what the rig says wrongly. An error δ of all inverse
+depths, an offset or a slope across the image, moves the newest keyframe by k_k (the solver's
 response) given a, along the path by g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another
 direction by θ than its mount says moves a pose T by (Ad(T⁻¹) − I) θ. Both stay in the error to the
 end, so they are carried as responses and squared only when asked for (a "consider" covariance):
@@ -29,11 +29,23 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleSolution
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_adjoint, se3_inverse
-from odomap.vision.stereo import StereoNoise
 
-__all__ = ["Calibration", "Drift"]
+__all__ = ["Calibration", "Drift", "NoiseConfig"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """How far what is measured may be off."""
+
+    position_px: float = 0.4
+    """Standard deviation of a tracked point's position."""
+    overlap: float = 4.0
+    """Factor on variances for errors that observations share: patches overlap, tracks go on."""
+    calibration_px: float = 0.15
+    """Standard deviation of the calibration: of disparities (offset, slopes), and of the camera's
+    direction on the body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +54,7 @@ class Drift:
 
     Attributes:
         covariance: (6, 6) due to noise, right tangent.
-        responses: (3, 6) motion of the pose per unit of disparity error over focal length: an
+        responses: (3, 6) motion of the pose per 1/m of error in all measured inverse depths: an
             offset, a slope in x, a slope in y of the normalised image.
     """
 
@@ -73,25 +85,39 @@ class Calibration:
     """How far the calibration may be off, as standard deviations.
 
     Attributes:
-        disparity: (3,) of disparities over focal length: offset, slopes in x and y.
+        inverse_depth: (3,) of measured inverse depths, 1/m: offset, slopes in x and y.
         direction: of the camera's direction about each axis, radians.
         Ad_body_camera: (6, 6) adjoint of the camera's mount.
     """
 
-    disparity: Array
+    inverse_depth: Array
     direction: float
     Ad_body_camera: Array
 
     @staticmethod
-    def of(noise: StereoNoise, camera: Camera, T_body_camera: Array) -> "Calibration":
-        """Take the deviations of a configuration; slopes reach theirs at the image's rim."""
-        sigma, rim = noise.calibration_px / camera.fx, 0.5 * camera.width / camera.fx
-        return Calibration(sigma / np.array([1.0, rim, rim]), sigma, se3_adjoint(T_body_camera))
+    def of(
+        noise: NoiseConfig, camera: Camera, T_body_camera: Array, inverse_depth: float
+    ) -> "Calibration":
+        """Gather the deviations; slopes reach theirs at the image's rim.
+
+        Args:
+            noise: of the images.
+            camera: the pinhole.
+            T_body_camera: (4, 4) its mount. A camera that is the body has no direction of its own.
+            inverse_depth: how far all measured inverse depths may be off together, 1/m.
+        """
+        rim = 0.5 * camera.width / camera.fx
+        is_body = np.array_equal(T_body_camera, np.eye(4))
+        return Calibration(
+            inverse_depth / np.array([1.0, rim, rim]),
+            0.0 if is_body else noise.calibration_px / camera.fx,
+            se3_adjoint(T_body_camera),
+        )
 
     def total(self, drift: Drift, T_world_body: Array) -> Array:
         """Return the (6, 6) covariance of a pose, calibration included."""
         mount = (se3_adjoint(se3_inverse(T_world_body)) - np.eye(6)) @ self.Ad_body_camera[:, 3:]
-        errors = self.disparity[:, None] * drift.responses
+        errors = self.inverse_depth[:, None] * drift.responses
         return np.asarray(
             drift.covariance + errors.T @ errors + self.direction**2 * mount @ mount.T
         )

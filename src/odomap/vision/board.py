@@ -29,13 +29,17 @@ from numpy.typing import NDArray
 
 from odomap.errors import InputError
 
-__all__ = ["Board", "find_board", "guess_size", "sharpness"]
+__all__ = ["Board", "choose_views", "find_board", "guess_size", "sharpness"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SEARCH_PX = 1000
 """Pictures are searched at most this wide or high; corners are then measured at full size."""
+BLURRED = 0.6
+"""A view is blurred that is less than this share as sharp as the usual one."""
+NEW_PX = 4.0
+"""A view is new whose corners are this far from those of any other, on average."""
 
 
 @dataclass(frozen=True)
@@ -213,3 +217,30 @@ def _tone(image: Image, square: Array) -> float:
     height, width = image.shape
     x, y = np.clip(place[:, 0], 0, width - 1), np.clip(place[:, 1], 0, height - 1)
     return float(image[y, x].mean())
+
+
+def choose_views(corners: Array, sharp: Array, most: int) -> NDArray[np.int64]:
+    """Choose views of a board that are sharp and differ from each other.
+
+    Args:
+        corners: (V, K) numbers that say where the board is in each view, pixels.
+        sharp: (V,) how sharp it is there.
+        most: how many at most.
+
+    Returns:
+        Their indices in order: the sharpest one, then again and again the one that differs most
+        from those chosen; none that is much blurred, or as good as one already there.
+    """
+    good = np.flatnonzero(sharp >= BLURRED * np.median(sharp)) if len(sharp) else np.zeros(0, int)
+    if len(good) == 0:
+        return np.zeros(0, np.int64)
+    chosen = [int(good[np.argmax(sharp[good])])]
+    gap = np.full(len(good), np.inf)
+    while len(chosen) < most:
+        step = np.abs(corners[good] - corners[chosen[-1]]).mean(axis=1)
+        gap = np.minimum(gap, step)
+        furthest = int(np.argmax(gap))
+        if gap[furthest] < NEW_PX:
+            break
+        chosen.append(int(good[furthest]))
+    return np.sort(np.array(chosen, dtype=np.int64))

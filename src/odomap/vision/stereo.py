@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from odomap.kernels import kernel
 from odomap.vision.patches import align_patches
 
-__all__ = ["StereoConfig", "StereoNoise", "match_sparse", "sgbm_disparity"]
+__all__ = ["StereoConfig", "match_sparse", "sgbm_disparity"]
 
 Image = NDArray[np.uint8]
 
@@ -48,20 +48,8 @@ class StereoConfig:
     """Smallest normalised correlation of the two patches."""
     max_vertical_px: float = 0.5
     """Largest distance of a match from its row."""
-
-
-@dataclass(frozen=True)
-class StereoNoise:
-    """Standard deviations of what is measured in the images."""
-
-    position_px: float = 0.4
-    """Of a tracked point's position."""
-    disparity_px: float = 0.8
-    """Of a stereo match's disparity."""
-    overlap: float = 4.0
-    """Factor on variances for errors that observations share: patches overlap, tracks go on."""
-    calibration_px: float = 0.15
-    """Of the calibration: of disparities (offset, slopes), and of the camera's direction."""
+    noise_px: float = 0.8
+    """Standard deviation of a disparity."""
 
 
 def match_sparse(

@@ -1,0 +1,314 @@
+"""Starting: the first keyframes, from nothing.
+
+Where depth is measured, one view is enough. A single camera needs two, far enough apart: corners
+of a first view are followed until a second one allows to triangulate them (`vision.bootstrap`).
+Both views are then adjusted together and become keyframes. The scale is free, and set once: the
+median depth is 1 at the start, and what it was when tracking starts anew. From then on it lives in
+the landmarks. The views between the two are placed when there are landmarks to place them with.
+
+Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces", ISMAR 2007.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend.bundle import Bundle, BundleConfig, solve_bundle
+from odomap.backend.motion import MotionSolution, Sightings, solve_motion
+from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
+from odomap.maps.map import Map
+from odomap.sensors.frame import Frame
+from odomap.system.association import Association, Reference, View
+from odomap.system.config import Config
+from odomap.system.eye import Eye
+from odomap.system.keyframing import Keyframes
+from odomap.system.path import Placed
+from odomap.system.ranging import UNIT_BASELINE
+from odomap.vision.bootstrap import BetweenView, TwoViewMotion, two_view_motion
+
+__all__ = ["OneViewStart", "Start", "Started", "TwoViewsStart", "Waiting"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MOST_BETWEEN = 60
+"""Frames between the two views that are remembered, and placed afterwards."""
+LEAST_PARALLAX = 3.0
+"""Standard deviations of a point's position; with less parallax it has no depth yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Started:
+    """A start that was made.
+
+    Attributes:
+        reference: the newest keyframe.
+        placed: frames that have a pose now, in order of time; the last is the one at hand.
+        count: landmarks in the newest keyframe.
+    """
+
+    reference: Reference
+    placed: tuple[Placed, ...]
+    count: int
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """No start yet, and why."""
+
+    reason: str
+
+
+class Start(Protocol):
+    """Makes the first keyframes."""
+
+    anew: str
+    """What to say of a start after a loss."""
+
+    def begin(
+        self, frame: Frame, view: View, T_world_body: Array, covariance: Array
+    ) -> Started | Waiting:
+        """Take the next frame.
+
+        Args:
+            frame: as it came.
+            view: its image.
+            T_world_body: (4, 4) where to begin.
+            covariance: (6, 6) how sure that is.
+        """
+        ...
+
+    def forget(self) -> None:
+        """Drop what was begun: tracking goes on without."""
+        ...
+
+
+class OneViewStart:
+    """Starts from one view whose depth is measured."""
+
+    anew = "started anew where it was last: how it moved since is not known"
+
+    def __init__(self, keyframes: Keyframes, association: Association, config: Config) -> None:
+        self._keyframes, self._association, self._config = keyframes, association, config
+
+    def begin(
+        self, frame: Frame, view: View, T_world_body: Array, covariance: Array
+    ) -> Started | Waiting:
+        """Start with a keyframe made from this view alone."""
+        missing = self._keyframes.missing(frame)
+        if missing:
+            return Waiting(f"{missing}: cannot start")
+        assert self._keyframes.ranger is not None, "one view needs measured depth"
+        points, _ = self._association.extend(view, np.empty((0, 2)), 200)
+        self._keyframes.ranger.check(frame, view, points)
+        seen = self._keyframes.begin(frame, view)
+        count = int(np.isfinite(seen.features.depth).sum())
+        needed = 2 * self._config.tracking.min_inliers
+        if count < needed:
+            why = f"{count} points with depth of {needed} needed to start"
+            return Waiting(f"{why}: too dark or no texture?")
+        made = self._keyframes.add(view, T_world_body, seen, -1, covariance)
+        placed = Placed(frame.stamp_ns, made.keyframe_id, np.eye(4), np.zeros((6, 6)))
+        return Started(made, (placed,), count)
+
+    def forget(self) -> None:
+        """Do nothing: nothing is begun that is not done."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Between:
+    """A frame after the first view: which corners were found in it, and where."""
+
+    stamp_ns: int
+    rows: Index
+    pixels: Array
+
+
+class TwoViewsStart:
+    """Starts from two views of a single camera.
+
+    Args:
+        map: where the landmarks go.
+        eye: the camera.
+        keyframes: makes keyframes.
+        association: finds corners again.
+        config: all sections.
+    """
+
+    anew = "started anew where it was last: the scale is new, how it moved since is not known"
+
+    def __init__(
+        self, map: Map, eye: Eye, keyframes: Keyframes, association: Association, config: Config
+    ) -> None:
+        self._map, self._eye, self._keyframes = map, eye, keyframes
+        self._association, self._config = association, config
+        self._first: View | None = None
+        self._corners, self._descriptors = np.empty((0, 2)), np.empty((0, 0), np.uint8)
+        self._pixels, self._alive = np.empty((0, 2)), np.empty(0, np.int64)
+        self._flow = np.empty((0, 2))
+        self._between: list[_Between] = []
+        self._depth = 1.0
+
+    def forget(self) -> None:
+        """Drop the first view."""
+        self._first, self._between = None, []
+
+    def begin(
+        self, frame: Frame, view: View, T_world_body: Array, covariance: Array
+    ) -> Started | Waiting:
+        """Follow the corners of the first view; start when they tell the motion."""
+        if self._first is None:
+            return self._look(view)
+        self._follow(self._first, view)
+        if len(self._alive) < max(self._config.bootstrap.min_points, 0.4 * len(self._corners)):
+            again = self._look(view)
+            return Waiting(f"the view changed before the motion was known; {again.reason}")
+        first, second = self._corners[self._alive], self._pixels
+        found = two_view_motion(
+            first, second, self._eye.camera, self._config.bootstrap, frame.id, self._views()
+        )
+        if found.T_second_first is None:
+            self._between.append(_Between(frame.stamp_ns, self._alive, self._pixels))
+            self._between = self._between[-MOST_BETWEEN:]
+            return Waiting(found.reason)
+        return self._start(frame, view, T_world_body, covariance, *self._adjusted(found))
+
+    def _look(self, view: View) -> Waiting:
+        """Take a view as the first."""
+        wanted = self._config.features.count
+        self._corners, self._descriptors = self._association.extend(view, np.empty((0, 2)), wanted)
+        self._pixels, self._alive = self._corners, np.arange(len(self._corners))
+        self._flow = np.zeros_like(self._pixels)
+        self._first, self._between = view, []
+        needed = 2 * self._config.bootstrap.min_points
+        if len(self._corners) < needed:
+            self._first = None
+            why = f"{len(self._corners)} corners of {needed} needed to start"
+            return Waiting(f"{why}: too dark or no texture?")
+        return Waiting("a first view is taken: move the camera sideways")
+
+    def _follow(self, first: View, view: View) -> None:
+        """Find the corners that are still alive, from where they were last."""
+        known = self._corners[self._alive], self._descriptors[self._alive]
+        still = np.tile(np.eye(2), (len(self._alive), 1, 1))
+        guess = self._pixels + self._flow
+        pixels, found = self._association.find(first, *known, view, guess, still)
+        self._flow = (pixels - self._pixels)[found]
+        self._pixels, self._alive = pixels[found], self._alive[found]
+
+    def _views(self) -> list[BetweenView]:
+        """Return the views between as rows of the corners alive now."""
+        at = np.full(len(self._corners), -1)
+        at[self._alive] = np.arange(len(self._alive))
+        views = [(at[b.rows], b.pixels) for b in self._between]
+        return [BetweenView(rows[rows >= 0], pixels[rows >= 0]) for rows, pixels in views]
+
+    def _adjusted(self, found: TwoViewMotion) -> tuple[Array, Array]:
+        """Adjust two views and their points; return T_first_second and the points, NaN if wrong.
+
+        The distance of the two is 1.
+        """
+        assert found.T_second_first is not None
+        good = np.flatnonzero(np.isfinite(found.points_first[:, 0]))
+        Ts = np.stack([np.eye(4), found.T_second_first.inverse().matrix])
+        n, camera = len(good), self._eye.camera
+        pixels = np.concatenate([self._corners[self._alive[good]], self._pixels[good]])
+        sigma = self._config.noise.position_px / camera.fx
+        bundle = Bundle(
+            Ts,
+            np.array([True, False]),
+            found.points_first[good],
+            np.eye(4)[None],
+            np.array([UNIT_BASELINE]),
+            np.repeat([0, 1], n),
+            np.tile(np.arange(n), 2),
+            np.zeros(2 * n, np.int64),
+            camera.undistort(pixels),
+            np.full(2 * n, np.nan),
+            np.full((2 * n, 2), 1.0 / sigma),
+            is_scale_free=True,
+        )
+        solution = solve_bundle(bundle, BundleConfig(iterations=20, tolerance=1e-4))
+        wrong = solution.chi2.reshape(2, n).max(axis=0) > self._config.window.gate**2
+        # Nearly parallel rays give no depth yet; their points stay candidates.
+        enough = found.parallax[good] >= LEAST_PARALLAX * sigma
+        points = np.full((len(found.points_first), 3), np.nan)
+        points[good] = np.where((wrong | ~enough)[:, None], np.nan, solution.points_world)
+        return solution.Ts_world_body[1], points
+
+    def _start(
+        self,
+        frame: Frame,
+        view: View,
+        T_world_body: Array,
+        covariance: Array,
+        T_first_second: Array,
+        points: Array,
+    ) -> Started | Waiting:
+        """Make keyframes of the two views, in a scale that fits what came before."""
+        assert self._first is not None
+        in_second = (points - T_first_second[:3, 3]) @ T_first_second[:3, :3]
+        good = np.isfinite(points[:, 0]) & (points[:, 2] > 0) & (in_second[:, 2] > 0)
+        if good.sum() < self._config.bootstrap.min_points:
+            return Waiting(f"{good.sum()} points of {self._config.bootstrap.min_points} agree")
+        scale = self._depth / float(np.median(in_second[good, 2]))
+        T_body_camera, T_camera_body = self._eye.T_body_camera, se3_inverse(self._eye.T_body_camera)
+        T_first_second = np.array(T_first_second)
+        T_first_second[:3, 3] *= scale
+        T_first_second = T_body_camera @ T_first_second @ T_camera_body
+        points = scale * points @ T_body_camera[:3, :3].T + T_body_camera[:3, 3]
+        points = np.where(good[:, None], points, np.nan)
+        first = self._first_keyframe(T_world_body, covariance, points)
+        placed = [Placed(self._first.stamp_ns, first.keyframe_id, np.eye(4), np.zeros((6, 6)))]
+        placed += self._placed_between(first.keyframe_id, points, T_first_second)
+        rows = np.flatnonzero(good)
+        here = self._motion(points[rows], self._pixels[rows], T_first_second)
+        Ad = se3_adjoint(se3_inverse(T_first_second))
+        sure = Ad @ covariance @ Ad.T + self._config.noise.overlap * here.covariance
+        T_world_second = T_world_body @ T_first_second
+        index = np.arange(len(rows))
+        seen = self._keyframes.measure(
+            frame, view, T_world_second, first, index, self._pixels[rows]
+        )
+        second = self._keyframes.add(view, T_world_second, seen, first.keyframe_id, sure)
+        placed.append(Placed(frame.stamp_ns, second.keyframe_id, np.eye(4), np.zeros((6, 6))))
+        self.forget()
+        return Started(second, tuple(placed), len(second.landmark_ids))
+
+    def _first_keyframe(self, T_world_body: Array, covariance: Array, points: Array) -> Reference:
+        """Make the first view a keyframe, with what is triangulated as landmarks."""
+        assert self._first is not None
+        points_world = points @ T_world_body[:3, :3].T + T_world_body[:3, 3]
+        pixels = self._corners[self._alive]
+        seen = self._keyframes.seen_first(self._first, pixels, points_world)
+        return self._keyframes.add(self._first, T_world_body, seen, -1, covariance)
+
+    def _placed_between(
+        self, keyframe_id: int, points: Array, T_first_second: Array
+    ) -> list[Placed]:
+        """Place the frames between the two views, from the landmarks they saw."""
+        of_corner = np.full((len(self._corners), 3), np.nan)
+        of_corner[self._alive] = points
+        twist, placed = se3_log(T_first_second), []
+        for k, between in enumerate(self._between):
+            known = np.isfinite(of_corner[between.rows, 0])
+            guess = se3_exp((k + 1) / (len(self._between) + 1) * twist)
+            found = self._motion(of_corner[between.rows[known]], between.pixels[known], guess)
+            if found.converged and found.inliers.sum() >= self._config.tracking.min_inliers:
+                covariance = self._config.noise.overlap * found.covariance
+                placed.append(Placed(between.stamp_ns, keyframe_id, found.T_world_body, covariance))
+        return placed
+
+    def _motion(self, points: Array, pixels: Array, guess: Array) -> MotionSolution:
+        """Find a body's pose (4, 4) in the first keyframe from points (n, 3) of it."""
+        camera = self._eye.camera
+        sightings = Sightings(
+            points,
+            camera.undistort(pixels),
+            np.full(len(points), np.nan),
+            np.full((len(points), 2), camera.fx / self._config.noise.position_px),
+        )
+        T_camera_body = se3_inverse(self._eye.T_body_camera)
+        return solve_motion(guess, T_camera_body, UNIT_BASELINE, sightings)
