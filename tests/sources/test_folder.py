@@ -55,16 +55,8 @@ def shown(source: FolderSource) -> list[tuple[int, ...]]:
 
 def test_natural_order() -> None:
     names = ["b2.png", "a10.png", "a9.png", "A1.png", "a09.png", "b.png", "7.png", "10.png"]
-    assert in_order(names) == [
-        "b.png",
-        "7.png",
-        "10.png",
-        "A1.png",
-        "a09.png",
-        "a9.png",
-        "a10.png",
-        "b2.png",
-    ] or in_order(names) == sorted(names, key=lambda n: in_order(names).index(n))
+    expected = "7.png 10.png A1.png a09.png a9.png a10.png b2.png b.png"
+    assert in_order(names) == expected.split()
     assert in_order(["f10.png", "f9.png", "f100.png"]) == ["f9.png", "f10.png", "f100.png"]
 
 
@@ -215,7 +207,7 @@ def test_pair_without_pairs(fill: Fill, tmp_path: Path) -> None:
 def test_counts_of_cameras_that_differ(fill: Fill, tmp_path: Path, calibrate: Fill) -> None:
     fill(["1.png", "2.png"], "rec/left")
     (tmp_path / "rec/rig.yaml").write_text(PAIR)
-    with pytest.raises(CalibrationError, match="rec/rig.yaml: has 2 cameras, but .* of one"):
+    with pytest.raises(CalibrationError, match=r"rec/rig\.yaml: has 2 cameras, but .* of one"):
         open_source(tmp_path / "rec")
     fill(["1.png", "2.png"], "rec/right", camera=1)
     calibrate(tmp_path / "rec/rig.yaml", SIZE)
@@ -227,10 +219,10 @@ def test_counts_of_cameras_that_differ(fill: Fill, tmp_path: Path, calibrate: Fi
 def test_images_in_a_folder_inside(fill: Fill, tmp_path: Path, calibrate: Fill) -> None:
     fill(["1.png", "2.png"], "rec/images")
     calibrate(tmp_path / "rec/rig.yaml", SIZE)
-    (tmp_path / "rec/times.txt").write_text("0\n2\n7\n")
+    (tmp_path / "rec/times.txt").write_text("0\n.2\n.7\n")
     source = open_source(tmp_path / "rec")
     assert source.name == "rec"
-    assert source.stamps_ns.tolist() == [2_000_000_000, 7_000_000_000]
+    assert source.stamps_ns.tolist() == [200_000_000, 700_000_000]
 
 
 def test_calibration(fill: Fill, tmp_path: Path, calibrate: Fill) -> None:

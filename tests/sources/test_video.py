@@ -326,6 +326,12 @@ def test_calibration_is_needed(clip: Make, calibrate: Make, tmp_path: Path) -> N
         open_source(file)
 
 
+def test_folder_that_holds_videos(clip: Make, tmp_path: Path) -> None:
+    clip()
+    with pytest.raises(InputError, match=r"holds videos: open one of them: clip\.mp4"):
+        open_source(tmp_path)
+
+
 def test_calibration_of_two_cameras(clip: Make, euroc: Make) -> None:
     rig = open_source(euroc()).rig
     with pytest.raises(CalibrationError, match="of one camera, but its calibration has 2"):

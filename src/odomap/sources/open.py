@@ -71,16 +71,19 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
         raise InputError(f"{root}: files of this kind cannot be opened; supported are {SUPPORTED}")
     if (root / "world.yaml").exists():
         return _simulated(str(root / "world.yaml"), rig)
-    readers = ((is_euroc, EurocSource), (is_kitti, KittiSource), (is_tum, TumSource))
-    for recognises, reader in readers:
-        if recognises(root):
-            return reader(root, _rig(root, rig))
-    calibration = _rig(root, rig)
+    if is_euroc(root):
+        return EurocSource(root, _rig(root, rig))
+    if is_kitti(root):
+        return KittiSource(root, _rig(root, rig))
+    given = None if rig is None else load_rig(rig)
+    if is_tum(root):
+        return TumSource(root, given)
+    calibration = given or rig_beside([root / "rig.yaml"])
     outside = next((p for p in list(root.resolve().parents)[:3] if _is_recording(p)), None)
     if outside is not None and calibration is None:
         raise InputError(f"{root}: is a part of a recording: open {outside}")
     if is_folder(root, calibration):
-        return FolderSource(root, calibration)
+        return FolderSource(root, given)
     raise InputError(_unrecognised(root))
 
 
@@ -128,5 +131,7 @@ def _unrecognised(root: Path) -> str:
             f"{root}: holds folders of images ({', '.join(pictures)}): open one of them, or name "
             "two 'left' and 'right', or as the cameras of the rig.yaml"
         )
+    if videos := [name for name in entries if is_video(root / name)]:
+        return f"{root}: is a folder that holds videos: open one of them: {', '.join(videos[:5])}"
     found = ", ".join(entries[:5]) + (", ..." if len(entries) > 5 else "")
     return f"{root}: not recognised (it holds {found}); supported are {SUPPORTED}"
