@@ -11,6 +11,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
+from odomap.cli.calibrate import Calibrate
 from odomap.cli.config import ConfigVerb
 from odomap.cli.demo import Demo
 from odomap.cli.doctor import Doctor
@@ -26,6 +27,7 @@ __all__ = ["Verb", "parse"]
 VERBS: dict[str, Any] = {
     "run": Run,
     "demo": Demo,
+    "calibrate": Calibrate,
     "eval": Evaluate,
     "export": Export,
     "info": Info,

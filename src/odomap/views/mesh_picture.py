@@ -85,23 +85,29 @@ def _from_above(mesh: Surface, Ts: Array, size: tuple[int, int]) -> tuple[Array,
     points = mesh.points.astype(np.float64)
     low, high = (np.quantile(points, q, axis=0) for q in (0.02, 0.98)) if len(points) else (up, up)
     middle = 0.5 * (low + high)
-    # From behind the cameras, or, where they look all round, from behind where they began to look.
-    ahead = Ts[:, :3, 2].mean(axis=0)
-    ahead = ahead if np.linalg.norm(ahead) > 0.3 else Ts[0, :3, 2]
-    ahead = ahead - up * (ahead @ up)
-    ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     steep = np.deg2rad(ABOVE_DEG)
+    ahead = _across(points - middle, up, Ts[:, :3, 2].mean(axis=0))
     z = np.cos(steep) * ahead - np.sin(steep) * up
     x = np.cross(z, up)
     x /= max(float(np.linalg.norm(x)), 1e-9)
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    reach = np.abs((points - middle) @ T[:3, :2]) if len(points) else np.ones((1, 2))
-    half = np.quantile(reach, 0.99, axis=0)
     focal = 2.0 * size[0]
-    far = max(half[0] / (0.45 * size[0]), half[1] / (0.45 * size[1])) * focal
-    T[:3, 3] = middle - (far + 0.5 * float(np.linalg.norm(high - low)) * np.cos(steep)) * z
+    # As near as leaves hardly a point outside.
+    offset = (points - middle) @ T[:3, :3]
+    needed = np.abs(offset[:, :2]) * focal / (0.47 * np.array(size)) - offset[:, 2:]
+    far = float(np.quantile(needed.max(axis=1), 0.995)) if len(points) else 1.0
+    T[:3, 3] = middle - far * z
     return np.asarray(np.linalg.inv(T)), focal
+
+
+def _across(offset: Array, up: Array, towards: Array) -> Array:
+    """Return the level direction across the longest extent, turned towards another."""
+    level = offset - np.outer(offset @ up, up)
+    along = np.linalg.eigh(level.T @ level)[1][:, 2]
+    across = np.cross(along, up)
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    return np.asarray(across if across @ towards >= 0.0 else -across)
 
 
 def _draw(
@@ -117,8 +123,9 @@ def _draw(
         np.ascontiguousarray(points), np.ascontiguousarray(turned), np.ascontiguousarray(colours),
         np.ascontiguousarray(mesh.faces), focal * SMOOTH, nearest, rgb,
     )  # fmt: skip
-    parts = rgb.reshape(size[1], SMOOTH, size[0], SMOOTH, 3)
-    return np.asarray(parts.mean(axis=(1, 3)) + 0.5, np.uint8)
+    import cv2
+
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @kernel
