@@ -64,11 +64,11 @@ def _scatter(ax: Axes, calibration: Calibration, c: int, role: str) -> None:
             (0, 0), radius, fill=False, ec=PALETTE["ink"], lw=1.0, ls=style, label=label
         )
         ax.add_patch(circle)
-    ax.set_aspect("equal", adjustable="box")
+    ax.set_aspect("equal", adjustable="box", anchor="W")
     ax.set_xlim(-limit, limit)
     ax.set_ylim(limit, -limit)
     outside = int(np.count_nonzero(np.abs(r).max(axis=1) > limit))
-    text = "blue: near the centre of the picture\nred: far from it"
+    text = "blue: near the centre,\nred: far from it"
     text += f"\n{outside} beyond the axes" if outside else ""
     ax.text(
         *(1.03, 0.0, text), transform=ax.transAxes, va="bottom", fontsize=8, color=PALETTE["muted"]
@@ -126,12 +126,12 @@ def _coverage(ax: Axes, calibration: Calibration, c: int) -> None:
         vmin=0,
         vmax=max(1.0, float(counts.max())) * 1.4,
         interpolation="nearest",
-        aspect="equal",
     )
+    ax.set_aspect("equal", anchor="W")
     ax.plot(uv[:, 0], uv[:, 1], ".", ms=1.6, color=PALETTE["ink"], alpha=0.6)
     ax.plot(camera.cx, camera.cy, "+", ms=11, mew=1.6, color=PALETTE["lost"], label="centre")
     _frame(ax, width, height)
-    legend(ax)
+    legend(ax, loc="upper left", bbox_to_anchor=(1.0, 1.0), ncols=1)
 
 
 def _arrows(ax: Axes, calibration: Calibration, c: int) -> None:
@@ -157,7 +157,7 @@ def _arrows(ax: Axes, calibration: Calibration, c: int) -> None:
         *place.T, *mean.T, angles="xy", scale_units="xy", scale=1.0 / factor, width=0.003,
         color=PALETTE["estimate"],
     )  # fmt: skip
-    ax.set_aspect("equal")
+    ax.set_aspect("equal", anchor="W")
     _frame(ax, width, height)
 
 
