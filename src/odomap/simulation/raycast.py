@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
 from odomap.kernels import kernel
-from odomap.simulation.rays import DEPTH, _enter, _meet
+from odomap.simulation.rays import DEPTH
 from odomap.simulation.scene import Scene
 from odomap.simulation.shade import _footprint, _lit, _texel, planes_kernel
 
@@ -32,7 +32,6 @@ F32 = NDArray[np.float32]
 Ids = NDArray[np.int32]
 SKY, DARK = -1, -2
 """What a ray meets where there is no surface, and where the lens lets no ray through."""
-FARTHEST = 1e9
 
 
 def raycast(
@@ -56,11 +55,13 @@ def raycast(
     columns, rows = np.meshgrid(np.arange(float(shape[1])), np.arange(float(shape[0])))
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     rays = camera.unproject(pixels)
-    ids = _who(scene, world, T_world_camera, rays)
+    surfaces = np.empty((len(world), 11))
+    surfaces_kernel(T_world_camera[:3, 3].copy(), world, scene.rectangles.faces, surfaces)
+    ids = _who(scene, surfaces, T_world_camera, rays)
     edges = _edges(ids.reshape(shape))
     around = (pixels[edges, None, :] + offsets).reshape(-1, 2)
     fine = camera.unproject(around)
-    fine_ids = _who(scene, world, T_world_camera, fine)
+    fine_ids = _who(scene, surfaces, T_world_camera, fine)
     planes = np.empty((len(world), 9))
     planes_kernel(views[0], scene.rectangles.faces, np.array([1.0, 1.0, 0.0, 0.0]), planes)
     radiance, depth = np.empty(len(rays), np.float32), np.empty(len(rays), np.float32)
@@ -78,16 +79,14 @@ def raycast(
     return radiance.reshape(shape), depth.reshape(shape), flow.reshape(*shape, 2)
 
 
-def _who(scene: Scene, world: Array, T_world_camera: Array, rays: Array) -> Ids:
+def _who(scene: Scene, surfaces: Array, T_world_camera: Array, rays: Array) -> Ids:
     """Return whom each ray (N, 3) in camera axes meets first."""
     ids = np.empty(len(rays), np.int32)
-    tree = scene.tree
+    boxes = scene.tree.boxes - np.tile(T_world_camera[:3, 3], 2)
     movers = np.flatnonzero(scene.rectangles.mover >= 0)
     directions = np.ascontiguousarray(rays @ T_world_camera[:3, :3].T)
-    nearest_kernel(
-        T_world_camera[:3, 3].copy(), directions, world, scene.rectangles.faces,
-        tree.boxes, tree.nodes, tree.order, movers, ids,
-    )  # fmt: skip
+    tree = scene.tree
+    nearest_kernel(directions, surfaces, boxes, tree.nodes, tree.order, movers, ids)
     return ids
 
 
@@ -103,60 +102,101 @@ def _edges(ids: Ids) -> NDArray[np.int64]:
 
 
 @kernel
-def _nearer(frame: Array, face: Array, o: Array, d: Array, still: Array, best: float) -> float:
-    """Return the distance to a rectangle if its front is hit before best, else best."""
-    facing = d[0] * (frame[4] * frame[8] - frame[5] * frame[7])
-    facing += d[1] * (frame[5] * frame[6] - frame[3] * frame[8])
-    facing += d[2] * (frame[3] * frame[7] - frame[4] * frame[6])
-    if facing <= 0.0 and face[6] == 0.0:
-        return best
-    found: float = _meet(frame, face, o, d, still, best)
-    return found
+def surfaces_kernel(o: Array, frames: Array, faces: Array, surfaces: Array) -> None:
+    """Write 1/t, s/t and t'/t of each rectangle as linear forms of a ray o + t d, and its sides.
+
+    q = N / N·(c - o),   u - u·(c - o) q,   v - v·(c - o) q,   a, b; zeros where o is behind it.
+    """
+    for i in range(frames.shape[0]):
+        f = frames[i]
+        x, y, z = f[0] - o[0], f[1] - o[1], f[2] - o[2]
+        nx = f[4] * f[8] - f[5] * f[7]
+        ny = f[5] * f[6] - f[3] * f[8]
+        nz = f[3] * f[7] - f[4] * f[6]
+        distance = nx * x + ny * y + nz * z
+        surfaces[i] = 0.0
+        if distance <= 1e-9 and (faces[i, 6] == 0.0 or distance >= -1e-9):
+            continue
+        q = nx / distance, ny / distance, nz / distance
+        uc = f[3] * x + f[4] * y + f[5] * z
+        vc = f[6] * x + f[7] * y + f[8] * z
+        for k in range(3):
+            surfaces[i, k] = q[k]
+            surfaces[i, 3 + k] = f[3 + k] - uc * q[k]
+            surfaces[i, 6 + k] = f[6 + k] - vc * q[k]
+        surfaces[i, 9], surfaces[i, 10] = faces[i, 0], faces[i, 1]
+
+
+@kernel
+def _nearer(p: Array, i: int, x: float, y: float, z: float, near: float) -> float:
+    """Return 1/t of the ray d = (x, y, z) if it meets rectangle i nearer than 1/near, else near."""
+    w: float = p[i, 0] * x + p[i, 1] * y + p[i, 2] * z
+    if w > near:
+        s = p[i, 3] * x + p[i, 4] * y + p[i, 5] * z
+        if 0.0 <= s <= p[i, 9] * w:
+            s = p[i, 6] * x + p[i, 7] * y + p[i, 8] * z
+            if 0.0 <= s <= p[i, 10] * w:
+                return w
+    return near
+
+
+@kernel
+def _enters(box: Array, i: int, x: float, y: float, z: float) -> float:
+    """Return where o + t d, with 1/d = (x, y, z), enters a box relative to o; infinity if never."""
+    ax, bx = box[i, 0] * x, box[i, 3] * x
+    ay, by = box[i, 1] * y, box[i, 4] * y
+    az, bz = box[i, 2] * z, box[i, 5] * z
+    enter = max(min(ax, bx), min(ay, by), min(az, bz), 0.0)
+    leave = min(max(ax, bx), max(ay, by), max(az, bz))
+    return enter if enter <= leave else np.inf
 
 
 @kernel
 def nearest_kernel(
-    o: Array, directions: Array, frames: Array, faces: Array, boxes: Array,
-    nodes: NDArray[np.int64], order: NDArray[np.int64], movers: NDArray[np.int64], ids: Ids,
+    directions: Array, surfaces: Array, boxes: Array, nodes: NDArray[np.int64],
+    order: NDArray[np.int64], movers: NDArray[np.int64], ids: Ids,
 ) -> None:  # fmt: skip
     """Write whom each ray o + t d meets first; SKY for nobody, DARK where d is NaN."""
-    stack = np.empty(DEPTH, np.int64)
-    still = np.zeros(3)
+    stack, enters = np.empty(DEPTH, np.int64), np.empty(DEPTH)
     who = SKY
     for r in range(directions.shape[0]):
-        d = directions[r]
-        if not d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 0.0:
+        x, y, z = directions[r, 0], directions[r, 1], directions[r, 2]
+        if not x * x + y * y + z * z > 0.0:
             ids[r] = DARK
             continue
-        best = FARTHEST
+        near = 0.0
         if who >= 0:
-            best = _nearer(frames[who], faces[who], o, d, still, best)
-        if best == FARTHEST:
+            near = _nearer(surfaces, who, x, y, z, 0.0)
+        if near == 0.0:
             who = SKY
-        stack[0] = 0
+        ix, iy, iz = 1.0 / x, 1.0 / y, 1.0 / z
+        stack[0], enters[0] = 0, 0.0
         top = 1
         while top > 0:
             top -= 1
-            node = stack[top]
-            if _enter(boxes[node], o, d, best) >= best:
+            if enters[top] * near >= 1.0:
                 continue
-            if nodes[node, 0] < 0:
-                first = -1 - nodes[node, 0]
-                for k in range(first, first + nodes[node, 1]):
-                    t = _nearer(frames[order[k]], faces[order[k]], o, d, still, best)
-                    if t < best:
-                        best, who = t, order[k]
+            a, b = nodes[stack[top], 0], nodes[stack[top], 1]
+            if a < 0:
+                for k in range(-1 - a, -1 - a + b):
+                    w = _nearer(surfaces, order[k], x, y, z, near)
+                    if w > near:
+                        near, who = w, order[k]
                 continue
-            a, b = nodes[node, 0], nodes[node, 1]
-            if _enter(boxes[a], o, d, best) < _enter(boxes[b], o, d, best):
-                a, b = b, a
-            stack[top] = a
-            stack[top + 1] = b
-            top += 2
+            # The nearer child is visited first: it goes on the stack last.
+            ta, tb = _enters(boxes, a, ix, iy, iz), _enters(boxes, b, ix, iy, iz)
+            if ta < tb:
+                a, b, ta, tb = b, a, tb, ta
+            if ta < np.inf:
+                stack[top], enters[top] = a, ta
+                top += 1
+            if tb < np.inf:
+                stack[top], enters[top] = b, tb
+                top += 1
         for k in range(movers.shape[0]):
-            t = _nearer(frames[movers[k]], faces[movers[k]], o, d, still, best)
-            if t < best:
-                best, who = t, movers[k]
+            w = _nearer(surfaces, movers[k], x, y, z, near)
+            if w > near:
+                near, who = w, movers[k]
         ids[r] = who
 
 
@@ -258,8 +298,10 @@ def warm_up() -> None:
     frames = np.array([[-0.5, -0.5, 1, 1, 0, 0, 0, 1, 0]])
     faces = np.array([[1.0, 1, 1, 0, 0, 1, 0, 0]])
     rays, ids = np.array([[0.0, 0.0, 1.0]]), np.empty(1, np.int32)
+    surfaces = np.empty((1, 11))
+    surfaces_kernel(np.zeros(3), frames, faces, surfaces)
     nearest_kernel(
-        np.zeros(3), rays, frames, faces, np.array([[-1.0, -1, -1, 1, 1, 1]]), np.array([[-1, 1]]),
+        rays, surfaces, np.array([[-1.0, -1, -1, 1, 1, 1]]), np.array([[-1, 1]]),
         np.zeros(1, np.int64), np.zeros(0, np.int64), ids,
     )  # fmt: skip
     planes = np.empty((1, 9))
