@@ -103,7 +103,7 @@ def vertices_kernel(
                     d0 = D[base + ob * sb + oc * sc]
                     d1 = D[base + ob * sb + oc * sc + sa]
                     gradient[axis] += d1 - d0
-                    total += d0
+                    total += d0 + d1
                     if _crosses(d0, d1, steepest):
                         crossings += 1
                         place[axis] += d0 / (d0 - d1)
