@@ -15,6 +15,7 @@ from odomap.files.rig import read_rig, write_rig
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import CameraMount, ImuMount, Rig
+from odomap.sources.calibration import load_rig
 
 SIZE = (640, 480)
 RADTAN = Camera("pinhole", [460.5, 459.25, 322.0, 238.5], [-0.28, 0.07, 2e-4, 1e-5], SIZE)
@@ -300,6 +301,12 @@ def test_what_is_none_of_them(tmp_path, text):
     known = r"rig.yaml \(odomap_rig: 1\), Kalibr's camchain.yaml .* OpenCV's or ROS'"
     with pytest.raises(CalibrationError, match=known):
         read_calibration(written(tmp_path, text))
+
+
+def test_what_is_given_with_rig_may_be_any_of_them(tmp_path):
+    camchain = written(tmp_path, {"cam0": kalibr_camera(FISHEYE)})
+    assert load_rig(str(camchain)).cameras[0].camera == FISHEYE
+    assert load_rig(written(tmp_path, ROS, "left.yaml")).cameras[0].name == "narrow_stereo"
 
 
 def test_xml_is_answered_with_the_mend(tmp_path):
