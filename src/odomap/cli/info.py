@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from odomap.errors import InputError
+
 if TYPE_CHECKING:
     from odomap.sources.source import Source
 
@@ -37,6 +39,8 @@ class Info:
 
         source = open_source(self.data, self.rig)
         facts = describe(source)
+        if self.check and not len(source):
+            raise InputError(f"{self.data}: a live camera has no end: leave --check out")
         if self.check:
             facts["readable"] = read_all(source)
             facts["skipped"] = [f"{item.file}: {item.reason}" for item in source.skipped]

@@ -7,6 +7,7 @@ Recognised by what a folder holds, not by its name:
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
+    live camera       a name "camera:0", "camera:0?width=640&height=480"
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
 A path that leads nowhere is answered with what stands nearest to it.
@@ -17,6 +18,7 @@ from pathlib import Path
 from odomap.errors import InputError, nearest_name
 from odomap.sensors.rig import Rig
 from odomap.sources.calibration import load_rig, rig_beside
+from odomap.sources.camera import PREFIX, CameraSource
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
@@ -29,16 +31,16 @@ __all__ = ["SUPPORTED", "open"]
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
-    "folders of images (one, or left/ and right/), "
+    "folders of images (one, or left/ and right/), live cameras ('camera:0'), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
 
 
 def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
-    """Open a recording or a simulated world; the format is recognised.
+    """Open a recording, a live camera or a simulated world; the format is recognised.
 
     Args:
-        path: a folder, a `world.yaml`, or a name that begins with "sim:".
+        path: a folder, a video, a `world.yaml`, or a name that begins with "sim:" or "camera:".
         rig: calibration to use instead of the recording's own: a rig, or a `rig.yaml`. Without
             it, a `rig.yaml` in the folder is used where the recording has no calibration.
 
@@ -54,6 +56,8 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
     """
     if isinstance(path, str) and path.startswith("sim:"):
         return _simulated(path, rig)
+    if isinstance(path, str) and path.startswith(PREFIX):
+        return CameraSource(path, None if rig is None else load_rig(rig))
     try:
         return _recognised(Path(path), rig)
     except OSError as error:
