@@ -160,6 +160,15 @@ def test_any_double_sphere_turns_back(xi, alpha, share, azimuth):
         np.testing.assert_allclose(found, [ray], rtol=0, atol=1e-6)
 
 
+def test_coefficients_of_next_to_nothing():
+    camera = Camera(
+        "kannala_brandt", [150, 150, 319.5, 239.5], [1e-3, 0, 1e-30, 5e-324], (640, 480)
+    )
+    plain = Camera("kannala_brandt", [150, 150, 319.5, 239.5], [1e-3, 0, 0, 0], (640, 480))
+    np.testing.assert_array_equal(camera.unproject([[9.0, 9.0]]), plain.unproject([[9.0, 9.0]]))
+    assert widest(camera) == widest(plain)
+
+
 def test_points_on_the_axis():
     for name, camera in CAMERAS.items():
         ahead, behind = camera.project([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0]])

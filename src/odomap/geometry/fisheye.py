@@ -39,7 +39,8 @@ class KannalaBrandt:
     def reach(self, distortion: Array) -> float:
         """Return the angle at which r(θ) stops growing, π at most."""
         slope = np.polynomial.Polynomial([1.0, *(np.array([3, 5, 7, 9]) * distortion)])
-        roots = slope.trim().roots()
+        # Coefficients that move nothing up to π would make the roots overflow.
+        roots = slope.trim(1e-18).roots()
         real = roots[np.abs(np.imag(roots)) < 1e-9].real
         return float(np.sqrt(np.min(real[real > 0], initial=np.pi**2)))
 

@@ -297,7 +297,7 @@ def warm_up() -> None:
     """Compile the kernels."""
     frames = np.array([[-0.5, -0.5, 1, 1, 0, 0, 0, 1, 0]])
     faces = np.array([[1.0, 1, 1, 0, 0, 1, 0, 0]])
-    rays, ids = np.array([[0.0, 0.0, 1.0]]), np.empty(1, np.int32)
+    rays, ids = np.array([[1e-9, 1e-9, 1.0]]), np.empty(1, np.int32)
     surfaces = np.empty((1, 11))
     surfaces_kernel(np.zeros(3), frames, faces, surfaces)
     nearest_kernel(
