@@ -1,18 +1,39 @@
-"""The examples and the README's code run as they are printed."""
+"""The examples and the README's code run as they are printed, and print what the lesson says."""
 
+import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from printed import assert_same_output
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
+def main_of(name: str) -> Callable[..., Any]:
+    return runpy.run_path(str(ROOT / "examples" / name))["main"]
+
+
+def shown_output(name: str) -> list[str]:
+    """Return what the lesson prints under `$ python examples/NAME`."""
+    found = []
+    for chapter in sorted((ROOT / "docs" / "lesson").glob("*.md")):
+        for block in chapter.read_text().split("```")[1::2]:
+            lines = block.splitlines()
+            if lines[0] == "console" and lines[1] == f"$ python examples/{name}":
+                found.append(lines[2:])
+    assert len(found) == 1, f"the lesson shows the output of {name} {len(found)} times"
+    return found[0]
+
+
 def test_there_are_examples():
-    assert EXAMPLES
+    assert len(EXAMPLES) >= 9
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -22,8 +43,72 @@ def test_an_example_is_short(path):
 
 def test_first_run(tmp_path):
     picture = tmp_path / "path.png"
-    main = runpy.run_path(str(ROOT / "examples" / "01_first_run.py"))["main"]
-    assert main(str(picture), "sim:room?seed=3&frames=10") < 0.02
+    assert main_of("01_first_run.py")(str(picture), "sim:room?seed=3&frames=10") < 0.02
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def run_as_shown(name: str, capsys: pytest.CaptureFixture[str]) -> Any:
+    results = main_of(name)()
+    assert_same_output(capsys.readouterr().out, shown_output(name))
+    return results
+
+
+def test_two_views(capsys):
+    results = run_as_shown("02_two_views.py", capsys)
+    assert results["turn_deg"] < 0.2
+    assert results["aim_deg"] < 1.0
+
+
+def test_points_and_pnp(capsys):
+    results = run_as_shown("03_points_and_pnp.py", capsys)
+    assert 0.9 < results["depth_ratio"] < 1.1
+    assert 0.7 < results["nees"] < 1.4
+
+
+def test_scale_and_window(capsys):
+    results = run_as_shown("04_scale_and_window.py", capsys)
+    assert results["spread"] < 0.2
+    assert results["after_mm"] < 3.0
+
+
+def test_stereo_depth(capsys):
+    results = run_as_shown("05_stereo_depth.py", capsys)
+    assert results["sigma_d_px"] < 0.2
+    assert 0.6 < results["far_ratio"] < 1.5
+
+
+def test_pitfalls_of_paths(capsys):
+    results = run_as_shown("06_pitfalls_path.py", capsys)
+    assert results["T_world_prev @ T_cur_prev.inverse()"] < 1e-6
+    assert results["T_world_prev @ T_cur_prev"] > 1.0
+    assert results["the same, each step 1 long"] > 3.0
+
+
+def test_pitfalls_of_the_mask(capsys):
+    results = run_as_shown("07_pitfalls_mask.py", capsys)
+    assert results["with the mask"] < 0.05
+    assert results["without the mask"] > 0.2
+
+
+def test_pitfalls_of_depth(capsys):
+    results = run_as_shown("08_pitfalls_depth.py", capsys)
+    assert results["1/z, on one surface"] < 0.7 * results["depth[int(v), int(u)]"]
+
+
+def test_pitfalls_of_tracks(capsys):
+    results = run_as_shown("09_pitfalls_tracks.py", capsys)
+    length, doubles, cover = results["look elsewhere"]
+    assert length > 2.5 * results["start anew"][0]
+    assert doubles < 2 < 50 < results["add anywhere"][1]
+    assert cover > results["add anywhere"][2]
+
+
+def test_solution_of_exercise_1(tmp_path):
+    picture = tmp_path / "path.png"
+    percent = main_of("exercise_1_solution.py")(
+        "sim:room?seed=4&frames=60&sensors=mono", str(picture)
+    )
+    assert percent < 1.0
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -43,8 +128,6 @@ def test_readme_code_runs(tmp_path):
 
 
 def test_readme_links_lead_somewhere():
-    import re
-
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text()):
         if "://" not in target:
             assert (ROOT / target).exists(), target

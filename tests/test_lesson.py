@@ -1,0 +1,104 @@
+"""The lesson keeps its word: code that is shown runs or stands in an example, links lead somewhere.
+
+A block of Python after a sentence with a link to an example is a part of that example, dedented.
+Every other block of Python runs; the blocks of a chapter share their names, from first to last.
+"""
+
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from printed import assert_same_output
+
+ROOT = Path(__file__).parent.parent
+LESSON = ROOT / "docs" / "lesson"
+PAGES = sorted(LESSON.glob("*.md"))
+CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
+EXAMPLE = re.compile(r"\(\.\./\.\./(examples/\w+\.py)\)")
+
+
+def python_blocks(page: Path) -> list[tuple[str | None, str, str | None]]:
+    """Return blocks of Python, each with the example it is from and the output under it."""
+    parts = [*page.read_text().split("```"), "", ""]
+    found = []
+    for before, block, between, after in zip(*(parts[k::2] for k in range(4))):
+        language, _, code = block.partition("\n")
+        if language == "python":
+            sentence = before.strip().split("\n\n")[-1]
+            source = EXAMPLE.findall(sentence) if sentence.endswith(":") else []
+            is_output = not between.strip() and after.startswith("text\n")
+            output = after.removeprefix("text\n") if is_output else None
+            found.append((source[-1] if source else None, code, output))
+    return found
+
+
+def lines_of(code: str) -> list[str]:
+    return [line.rstrip() for line in textwrap.dedent(code).strip().splitlines()]
+
+
+def test_there_are_chapters():
+    assert [page.name for page in CHAPTERS] == [
+        "01_what_is_slam.md",
+        "02_visual_odometry.md",
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_quoted_code_stands_in_its_example(page):
+    for source, code, _ in python_blocks(page):
+        if source is None:
+            continue
+        wanted, lines = lines_of(code), (ROOT / source).read_text().splitlines()
+        starts = range(len(lines) - len(wanted) + 1)
+        pieces = (lines_of("\n".join(lines[i : i + len(wanted)])) for i in starts)
+        assert wanted in pieces, f"{source} does not hold:\n{code}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_free_code_runs_and_prints_what_is_shown(page, capsys):
+    names: dict[str, object] = {}
+    for number, (source, code, shown) in enumerate(python_blocks(page)):
+        if source is None:
+            exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+            printed = capsys.readouterr().out
+            if shown is not None:
+                assert_same_output(printed, shown.splitlines())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_formulas_and_fences_are_closed(page):
+    text = page.read_text()
+    assert text.count("```") % 2 == 0
+    prose = "".join(text.split("```")[0::2])
+    assert prose.count("$") % 2 == 0
+
+
+def test_pictures_are_small_and_all_used():
+    pictures = [p for p in sorted((LESSON / "images").iterdir()) if p.suffix in (".png", ".jpg")]
+    text = "".join(page.read_text() for page in PAGES)
+    assert pictures
+    for picture in pictures:
+        assert picture.stat().st_size < 150_000, picture.name
+        assert f"images/{picture.name}" in text, picture.name
+
+
+def test_blocks_are_found():
+    blocks = [block for page in CHAPTERS for block in python_blocks(page)]
+    assert sum(source is not None for source, _, _ in blocks) >= 8
+    assert sum(output is not None for _, _, output in blocks) >= 7
+
+
+@pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
+def test_other_output_is_noticed(printed):
+    assert_same_output("off by 2.1 mm, ok\n", ["off by 2.2 mm, ok"])
+    with pytest.raises(AssertionError):
+        assert_same_output(printed, ["off by 2.2 mm, ok"])
