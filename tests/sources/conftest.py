@@ -1,4 +1,4 @@
-"""Small recordings in the layouts of EuRoC and KITTI, written for a test and then broken by it."""
+"""Small recordings of every kind, written for a test and then broken by it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -99,6 +99,57 @@ def write_kitti(root: Path, frames: int = 6, pair: tuple[int, ...] = (0, 1)) -> 
         "".join(f"1 0 0 0 0 1 0 0 0 0 1 {1.5 * i}\n" for i in range(frames))
     )
     return root
+
+
+TUM_START_NS = 1305031229_500_000_000
+TUM_RIG = """odomap_rig: 1
+cameras:
+  - {name: rgb, intrinsics: [60, 60, 32, 24], distortion: [0.1, -0.2, 0, 0], resolution: [64, 48]}
+depth: {camera: rgb, factor: 5000.0, invalid: [0, 65535]}
+"""
+
+
+def depth_picture(index: int, factor: float = 5000.0) -> NDArray[np.uint16]:
+    """Return a slope from 0.8 to 3 m with a hole, an overflow, and the number of the frame."""
+    slope = np.linspace(0.8, 3, SIZE[0])[None, :].repeat(SIZE[1], 0)
+    image = np.round(slope * factor).astype(np.uint16)
+    image[10:14, 10:14] = 0
+    image[20:22, 20:22] = 65535
+    image[0, 0] = 5000 + index
+    return image
+
+
+def write_tum(root: Path, frames: int = 8, lag_ns: int = 3_000_000, factor: float = 5000.0) -> Path:
+    """Write a TUM recording whose depth comes 3 ms after colour, and return its folder."""
+
+    def stamp(index: int, offset_ns: int = 0) -> str:
+        ns = TUM_START_NS + round(index * 1e9 / 30) + offset_ns
+        return f"{ns // 10**9}.{ns % 10**9 // 1000:06d}"
+
+    colour, depth, truth = ["# color images"], ["# depth maps"], ["# ground truth"]
+    for i in range(frames):
+        grey = picture(i, 0)
+        save(root / f"rgb/{stamp(i)}.png", np.dstack([grey // 2, grey, grey]))
+        save(root / f"depth/{stamp(i, lag_ns)}.png", depth_picture(i, factor))
+        colour.append(f"{stamp(i)} rgb/{stamp(i)}.png")
+        depth.append(f"{stamp(i, lag_ns)} depth/{stamp(i, lag_ns)}.png")
+        truth.append(f"{stamp(i, 1000)} {i / 10} 0 0 0 0 0 1")
+    truth.append(f"{stamp(frames)} {frames / 10} 0 0 0 0 0 1")
+    (root / "rgb.txt").write_text("\n".join(colour) + "\n")
+    (root / "depth.txt").write_text("\n".join(depth) + "\n")
+    (root / "groundtruth.txt").write_text("\n".join(truth) + "\n")
+    (root / "rig.yaml").write_text(TUM_RIG)
+    return root
+
+
+@pytest.fixture
+def tum(tmp_path: Path) -> Callable[..., Path]:
+    return lambda name="desk", **options: write_tum(tmp_path / name, **options)
+
+
+@pytest.fixture
+def draw_depth() -> Callable[..., NDArray[np.uint16]]:
+    return depth_picture
 
 
 @pytest.fixture

@@ -9,9 +9,19 @@ import pytest
 from odomap.errors import InputError
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
-from odomap.sources.disturb import blank, blur, drop, freeze, reverse, there_and_back
+from odomap.sources.disturb import (
+    blank,
+    blur,
+    drop,
+    freeze,
+    pierce_depth,
+    reverse,
+    roughen_depth,
+    there_and_back,
+)
 from odomap.sources.euroc import EurocSource
 from odomap.sources.source import RandomAccess, Skipped, Source
+from odomap.sources.tum import TumSource
 
 START_NS = 1403636584763555584
 STEP_NS = 50_000_000
@@ -64,6 +74,8 @@ ALL: dict[str, Callable[[Source], Source]] = {
     "blur": lambda s: blur(s, [2, 3]),
     "drop": lambda s: drop(s, [2, 3]),
     "freeze": lambda s: freeze(s, [2, 3]),
+    "pierce_depth": lambda s: pierce_depth(s, [2, 3], share=0.5),
+    "roughen_depth": lambda s: roughen_depth(s, [2, 3]),
     "reverse": reverse,
     "there_and_back": there_and_back,
     "nested": lambda s: there_and_back(drop(blank(drop(freeze(s, [1]), [2]), [3]), [4])),
@@ -216,3 +228,74 @@ def test_streams_play_forwards_only() -> None:
 def test_there_and_back_needs_three_frames(source: EurocSource) -> None:
     with pytest.raises(InputError, match="three frames"):
         there_and_back(drop(source, range(2, 7)))
+
+
+def test_blank_takes_depth_with_it_or_not(tum: Callable[..., Path]) -> None:
+    source = TumSource(tum())
+    hand, night = blank(source, [3]), blank(source, [3], depth=False)
+    for wrapped, is_dark in ((hand, True), (night, False)):
+        frames = list(wrapped)
+        assert [frame.images[0].any() for frame in frames] == [i != 3 for i in range(8)]
+        assert [bool(frame.depth.any()) for frame in frames] == [
+            i != 3 or not is_dark for i in range(8)
+        ]
+    np.testing.assert_array_equal(night.frame(3).depth, source.frame(3).depth)
+
+
+def test_frozen_dropped_and_reversed_depth(tum: Callable[..., Path]) -> None:
+    source = TumSource(tum())
+    number = [frame.depth[0, 0] for frame in source]
+    assert len(set(number)) == 8
+    frozen = [frame.depth[0, 0] for frame in freeze(source, [3, 4])]
+    assert frozen == [*number[:3], number[2], number[2], *number[5:]]
+    assert [f.depth[0, 0] for f in drop(source, [0, 6])] == [*number[1:6], number[7]]
+    assert [f.depth[0, 0] for f in reverse(source)] == number[::-1]
+    forth = [*range(0, 8, 2), *range(7, 0, -2)]
+    assert [f.depth[0, 0] for f in there_and_back(source)] == [number[i] for i in forth]
+
+
+def test_pierced_depth(tum: Callable[..., Path]) -> None:
+    source = TumSource(tum())
+    boxed = pierce_depth(source, [2], box=(30, 5, 20, 10))
+    for frame, whole in zip(boxed, source, strict=True):
+        lost = (frame.depth == 0) & (whole.depth > 0)
+        assert np.count_nonzero(lost) == (200 if frame.id == 2 else 0)
+        assert np.all(lost[5:15, 30:50]) == (frame.id == 2)
+        np.testing.assert_array_equal(frame.depth[~lost], whole.depth[~lost])
+        np.testing.assert_array_equal(frame.images[0], whole.images[0])
+    patchy = pierce_depth(source, share=0.4, seed=1)
+    lost = [(frame.depth == 0).reshape(6, 8, 8, 8).all((1, 3)) for frame in patchy]
+    assert 0.3 < np.mean(lost) < 0.5
+    # Each frame has its own holes, the same whenever it is read.
+    assert not np.array_equal(lost[0], lost[1])
+    np.testing.assert_array_equal(patchy.frame(5).depth, list(patchy)[5].depth)
+    assert not np.any(pierce_depth(source, share=1.0).frame(0).depth)
+    with pytest.raises(InputError, match=r"share 1\.5 must be from 0 to 1"):
+        pierce_depth(source, share=1.5)
+
+
+def test_rough_depth(tum: Callable[..., Path]) -> None:
+    source = TumSource(tum())
+    rough = roughen_depth(source, sigma_m=0.01)
+    errors = np.array([r.depth - f.depth for r, f in zip(rough, source, strict=True)])
+    depth = source.frame(0).depth
+    assert rough.frame(3).depth.dtype == np.float32
+    assert np.all((rough.frame(3).depth == 0) == (source.frame(3).depth == 0))
+    # At z the noise is sigma_m z²: the near and the far end of the slope.
+    for columns, z in ((slice(0, 8), 0.92), (slice(56, 64), 2.88)):
+        part = errors[:, 24:, columns]
+        assert np.std(part) == pytest.approx(0.01 * z**2, rel=0.12)
+        assert abs(np.mean(part)) < 0.002 * z**2
+    assert np.all(errors[:, depth == 0] == 0)
+    np.testing.assert_array_equal(rough.frame(5).depth, list(rough)[5].depth)
+    some = roughen_depth(source, [1])
+    np.testing.assert_array_equal(some.frame(0).depth, depth)
+    with pytest.raises(InputError, match="sigma_m -1 must be 0 or more"):
+        roughen_depth(source, sigma_m=-1)
+
+
+def test_sources_without_depth_stay_as_they_are(source: EurocSource) -> None:
+    for wrapped in (pierce_depth(source, share=0.5), roughen_depth(source)):
+        frames = list(wrapped)
+        assert all(frame.depth is None for frame in frames)
+        assert len(frames) == len(source)

@@ -77,3 +77,30 @@ def test_an_open_recording_is_small(recording: Path) -> None:
     # Stamps and names; the allowance is for what Python keeps of the modules.
     assert size < imu_and_truth + len(source) * 500 + 200_000
     assert size < 4 * PAIR_BYTES
+
+
+def test_memory_does_not_grow_with_a_video(clip: Callable[..., Path]) -> None:
+    source = open_source(clip("clip.avi", code="MJPG", frames=120, size=SIZE))
+    gc.collect()
+    tracemalloc.start()
+    try:
+        sizes = list(held(source))
+        peak = tracemalloc.get_traced_memory()[1] - min(sizes)
+    finally:
+        tracemalloc.stop()
+    assert len(sizes) == 120
+    # In colour and grey; what FFmpeg keeps is not counted here.
+    assert peak < 8 * PAIR_BYTES
+    assert max(sizes[-40:]) - max(sizes[:40]) < PAIR_BYTES // 8
+
+
+def test_memory_does_not_grow_with_depth(tum: Callable[..., Path]) -> None:
+    source = open_source(tum(frames=80))
+    gc.collect()
+    tracemalloc.start()
+    try:
+        sizes = list(held(source))
+    finally:
+        tracemalloc.stop()
+    # Not even one depth image of four bytes a pixel, though the list of sizes grows.
+    assert max(sizes[-30:]) - max(sizes[:30]) < 4 * 64 * 48

@@ -20,56 +20,15 @@ from odomap.sources.open import open as open_source
 from odomap.sources.source import Coloured, RandomAccess, UnusableFrame
 from odomap.sources.tum import TumSource
 
+Draw = Callable[..., NDArray[np.uint16]]
 Save = Callable[[Path, NDArray[np.generic]], None]
 Write = Callable[..., Path]
 START_NS = 1305031229_500_000_000
-SIZE = (64, 48)
-RIG = """odomap_rig: 1
-cameras:
-  - {name: rgb, intrinsics: [60, 60, 32, 24], distortion: [0.1, -0.2, 0, 0], resolution: [64, 48]}
-depth: {camera: rgb, factor: 5000.0, invalid: [0, 65535]}
-"""
 
 
 def stamp(index: float, offset_ns: int = 0) -> str:
     ns = START_NS + round(index * 1e9 / 30) + offset_ns
     return f"{ns // 10**9}.{ns % 10**9 // 1000:06d}"
-
-
-def depth_picture(index: int, factor: float = 5000.0) -> NDArray[np.uint16]:
-    """Return a slope from 0.8 to 3 m with a hole, an overflow, and the number of the frame."""
-    slope = np.linspace(0.8, 3, SIZE[0])[None, :].repeat(SIZE[1], 0)
-    image = np.round(slope * factor).astype(np.uint16)
-    image[10:14, 10:14] = 0
-    image[20:22, 20:22] = 65535
-    image[0, 0] = 5000 + index
-    return image
-
-
-@pytest.fixture
-def tum(tmp_path: Path, save_image: Save, draw: Callable[..., NDArray[np.uint8]]) -> Write:
-    """Return what writes a recording whose depth comes 3 ms after colour."""
-
-    def write(
-        name: str = "desk", frames: int = 8, lag_ns: int = 3_000_000, factor: float = 5000.0
-    ) -> Path:
-        root = tmp_path / name
-        colour, depth, truth = ["# color images"], ["# depth maps"], ["# ground truth"]
-        for i in range(frames):
-            grey = draw(i, 0)
-            save_image(root / f"rgb/{stamp(i)}.png", np.dstack([grey // 2, grey, grey]))
-            save_image(root / f"depth/{stamp(i, lag_ns)}.png", depth_picture(i, factor))
-            colour.append(f"{stamp(i)} rgb/{stamp(i)}.png")
-            depth.append(f"{stamp(i, lag_ns)} depth/{stamp(i, lag_ns)}.png")
-            truth.append(f"{stamp(i, 1000)} {i / 10} 0 0 0 0 0 1")
-        truth.append(f"{stamp(frames)} {frames / 10} 0 0 0 0 0 1")
-        (root / "rgb.txt").write_text("\n".join(colour) + "\n")
-        (root / "depth.txt").write_text("\n".join(depth) + "\n")
-        (root / "groundtruth.txt").write_text("\n".join(truth) + "\n")
-        (root / "rig.yaml").write_text(RIG)
-        return root
-
-    return write
 
 
 def edit(file: Path, old: str, new: str) -> None:
@@ -221,10 +180,10 @@ def test_calibration_of_two_cameras(tum: Write) -> None:
         TumSource(root, Rig((one, replace(one, name="other"))))
 
 
-def test_depth_of_another_size(tum: Write, save_image: Save) -> None:
+def test_depth_of_another_size(tum: Write, save_image: Save, draw_depth: Draw) -> None:
     root = tum()
     for file in (root / "depth").iterdir():
-        save_image(file, depth_picture(0)[::2, ::2])
+        save_image(file, draw_depth(0)[::2, ::2])
     with pytest.raises(CalibrationError) as caught:
         TumSource(root)
     text = str(caught.value)
@@ -232,9 +191,11 @@ def test_depth_of_another_size(tum: Write, save_image: Save) -> None:
     assert "64x48: depth must be registered to the colour camera; export it aligned" in text
 
 
-def test_one_depth_of_another_size_costs_that_depth(tum: Write, save_image: Save) -> None:
+def test_one_depth_of_another_size_costs_that_depth(
+    tum: Write, save_image: Save, draw_depth: Draw
+) -> None:
     root = tum()
-    save_image(root / f"depth/{stamp(2, 3_000_000)}.png", depth_picture(2)[::2, ::2])
+    save_image(root / f"depth/{stamp(2, 3_000_000)}.png", draw_depth(2)[::2, ::2])
     source = TumSource(root)
     frames = list(source)
     assert [frame.id for frame in frames if frame.depth is None] == [2]

@@ -1,7 +1,8 @@
 """Disturbances: wrap a source to see what a system does when sensors fail or places recur.
 
-    blank, drop, freeze, blur     a covered lens, lost frames, a camera that hangs, fast motion
-    reverse, there_and_back       the same recording played backwards, or forth and back
+    blank, drop, freeze, blur       a covered lens, lost frames, a camera that hangs, fast motion
+    pierce_depth, roughen_depth     depth with holes (glass, black cloth, the sun), or noise
+    reverse, there_and_back         the same recording played backwards, or forth and back
 
 Each wrapper is a source like any other: it streams, its stamps increase strictly, and its truth is
 that of the frames it gives, so wrappers nest and every metric works on them. Played there and
@@ -16,7 +17,7 @@ Reference: J. Engel, V. Usenko, D. Cremers, "A photometrically calibrated benchm
 visual odometry", arXiv:1607.02555, 2016 (sequences played forwards and backwards).
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 
 import cv2
@@ -25,18 +26,33 @@ from numpy.typing import NDArray
 
 from odomap.errors import InputError
 from odomap.geometry.trajectory import Trajectory
-from odomap.sensors.frame import Frame, ImuSamples
-from odomap.sources.source import RandomAccess, Skipped, Source, UnusableFrame
+from odomap.sensors.frame import Frame
+from odomap.sources.source import Source
+from odomap.sources.wrappers import Changed, Dropped, Frozen, Replayed, seekable
 
-__all__ = ["blank", "blur", "drop", "freeze", "reverse", "there_and_back"]
+__all__ = [
+    "blank",
+    "blur",
+    "drop",
+    "freeze",
+    "pierce_depth",
+    "reverse",
+    "roughen_depth",
+    "there_and_back",
+]
+
+PATCH_PX = 8
+"""Side of the patches of depth that are lost together."""
 
 
-def blank(source: Source, frames: Iterable[int]) -> Source:
+def blank(source: Source, frames: Iterable[int], *, depth: bool = True) -> Source:
     """Blacken the images of some frames: a covered lens, or no light.
 
     Args:
         source: any source.
         frames: ids of the frames.
+        depth: whether depth goes, too, as under a hand. Without light it stays: a depth camera
+            brings its own.
     """
     chosen = frozenset(frames)
 
@@ -44,10 +60,80 @@ def blank(source: Source, frames: Iterable[int]) -> Source:
         if frame.id not in chosen:
             return frame
         dark = tuple(None if image is None else np.zeros_like(image) for image in frame.images)
-        depth = None if frame.depth is None else np.zeros_like(frame.depth)
-        return replace(frame, images=dark, depth=depth)
+        if frame.depth is None or not depth:
+            return replace(frame, images=dark)
+        return replace(frame, images=dark, depth=np.zeros_like(frame.depth))
 
-    return _Changed(source, "blank", change)
+    return Changed(source, "blank", change)
+
+
+def pierce_depth(
+    source: Source,
+    frames: Iterable[int] | None = None,
+    *,
+    share: float = 0.0,
+    box: tuple[int, int, int, int] | None = None,
+    seed: int = 0,
+) -> Source:
+    """Set depth to unknown in a part of the image: glass, black cloth, the sun.
+
+    Args:
+        source: any source; frames without depth stay as they are.
+        frames: ids of the frames; default all.
+        share: share of the pixels that are lost, from 0 to 1, in square patches.
+        box: first column, first row, width and height of a rectangle that is lost, pixels.
+        seed: of the places of the patches.
+
+    Raises:
+        InputError: the share is not from 0 to 1.
+    """
+    if not 0 <= share <= 1:
+        raise InputError(f"pierce_depth: share {share} must be from 0 to 1")
+    chosen = None if frames is None else frozenset(frames)
+
+    def change(frame: Frame) -> Frame:
+        if frame.depth is None or (chosen is not None and frame.id not in chosen):
+            return frame
+        depth = frame.depth.copy()
+        rows, columns = (-(-size // PATCH_PX) for size in depth.shape)
+        lost = np.random.default_rng((seed, frame.id)).random((rows, columns)) < share
+        lost = lost.repeat(PATCH_PX, 0).repeat(PATCH_PX, 1)[: depth.shape[0], : depth.shape[1]]
+        depth[lost] = 0
+        if box is not None:
+            x, y, width, height = box
+            depth[y : y + height, x : x + width] = 0
+        return replace(frame, depth=depth)
+
+    return Changed(source, "pierced depth", change)
+
+
+def roughen_depth(
+    source: Source, frames: Iterable[int] | None = None, *, sigma_m: float = 0.002, seed: int = 0
+) -> Source:
+    """Add noise to depth that grows with its square, as triangulation has it.
+
+    Args:
+        source: any source; unknown depth stays unknown.
+        frames: ids of the frames; default all.
+        sigma_m: standard deviation at a depth of 1 m, metres; at z it is sigma_m · z².
+        seed: of the noise.
+
+    Raises:
+        InputError: sigma_m is negative.
+    """
+    if not sigma_m >= 0:
+        raise InputError(f"roughen_depth: sigma_m {sigma_m} must be 0 or more")
+    chosen = None if frames is None else frozenset(frames)
+
+    def change(frame: Frame) -> Frame:
+        if frame.depth is None or (chosen is not None and frame.id not in chosen):
+            return frame
+        rng = np.random.default_rng((seed, frame.id))
+        noise = rng.standard_normal(frame.depth.shape, np.float32)
+        rough = frame.depth + np.float32(sigma_m) * frame.depth**2 * noise
+        return replace(frame, depth=np.maximum(rough, 0).astype(np.float32))
+
+    return Changed(source, "rough depth", change)
 
 
 def blur(
@@ -75,7 +161,7 @@ def blur(
         )
         return replace(frame, images=smeared)
 
-    return _Changed(source, "blur", change)
+    return Changed(source, "blur", change)
 
 
 def _line(length: float, angle: float) -> NDArray[np.float64]:
@@ -99,7 +185,7 @@ def drop(source: Source, frames: Iterable[int]) -> Source:
         source: any source.
         frames: ids of the frames; the ids of the others stay, so that the gaps show.
     """
-    return _Dropped(source, frozenset(frames))
+    return Dropped(source, frozenset(frames))
 
 
 def freeze(source: Source, frames: Iterable[int]) -> Source:
@@ -109,7 +195,7 @@ def freeze(source: Source, frames: Iterable[int]) -> Source:
         source: any source.
         frames: ids of the frames; the first frame of a source cannot hang.
     """
-    return _Frozen(source, frozenset(frames))
+    return Frozen(source, frozenset(frames))
 
 
 def reverse(source: Source) -> Source:
@@ -125,8 +211,8 @@ def reverse(source: Source) -> Source:
     Raises:
         InputError: the source is a stream only.
     """
-    seekable = _seekable(source)
-    stamps = seekable.stamps_ns
+    inner = seekable(source)
+    stamps = inner.stamps_ns
     order = np.arange(len(stamps))[::-1]
     mirror = int(stamps[0]) + int(stamps[-1]) if len(stamps) else 0
     truth = source.truth
@@ -136,7 +222,7 @@ def reverse(source: Source) -> Source:
             truth.Ts_world_body[::-1],
             None if truth.covariances is None else truth.covariances[::-1],
         )
-    return _Replayed(seekable, "reversed", order, mirror - stamps[::-1], truth)
+    return Replayed(inner, "reversed", order, mirror - stamps[::-1], truth)
 
 
 def there_and_back(source: Source) -> Source:
@@ -152,16 +238,16 @@ def there_and_back(source: Source) -> Source:
     Raises:
         InputError: the source is a stream only, or has less than three frames.
     """
-    seekable = _seekable(source)
-    stamps = seekable.stamps_ns
+    inner = seekable(source)
+    stamps = inner.stamps_ns
     if len(stamps) < 3:
         raise InputError(f"{source.name}: there and back needs three frames or more")
     places = np.arange(len(stamps))
     order = np.concatenate([places[::2], places[1::2][::-1]])
     step = 2 * round(float(np.median(np.diff(stamps))))
     played = stamps[0] + places * step
-    return _Replayed(
-        seekable, "there and back", order, played, _retimed(source.truth, stamps[order], played)
+    return Replayed(
+        inner, "there and back", order, played, _retimed(source.truth, stamps[order], played)
     )
 
 
@@ -179,170 +265,3 @@ def _retimed(
     back = np.empty_like(in_order)
     back[in_order] = np.arange(len(in_order))
     return Trajectory(played[covered], poses[back])
-
-
-def _seekable(source: Source) -> RandomAccess:
-    """Return the source as one that can be read in any order."""
-    if not isinstance(source, RandomAccess):
-        raise InputError(f"{source.name}: is a stream: it can only be played forwards")
-    return source
-
-
-class _Wrapper:
-    """What all wrappers share: the face of the source inside."""
-
-    stamps_ns: NDArray[np.int64]
-    """(N,) stamps of the frames; only there if they can be read in any order."""
-
-    def __init__(self, source: Source, how: str) -> None:
-        self.source = source
-        self.name = f"{source.name} ({how})"
-        self.rig = source.rig
-        self.truth = source.truth
-        self.skipped: list[Skipped] = []
-        self.notes: list[str] = list(getattr(source, "notes", []))
-        if isinstance(source, RandomAccess):
-            self.stamps_ns = source.stamps_ns
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    @property
-    def ids(self) -> NDArray[np.int_]:
-        """(N,) ids of the frames."""
-        inner = self.source
-        return inner.ids if isinstance(inner, _Wrapper) else np.arange(len(inner))
-
-    @property
-    def _inside(self) -> RandomAccess:
-        return _seekable(self.source)
-
-    def _frames(self) -> Iterator[Frame]:
-        """Iterate the source inside, and show what it skips."""
-        for frame in self.source:
-            self.skipped = self.source.skipped
-            yield frame
-        self.skipped = self.source.skipped
-
-
-class _Changed(_Wrapper):
-    """Frames changed one by one."""
-
-    def __init__(self, source: Source, how: str, change: Callable[[Frame], Frame]) -> None:
-        super().__init__(source, how)
-        self._change = change
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, changed."""
-        return map(self._change, self._frames())
-
-    def frame(self, index: int) -> Frame:
-        """Return one frame, changed."""
-        return self._change(self._inside.frame(index))
-
-
-class _Frozen(_Wrapper):
-    """Images that repeat."""
-
-    def __init__(self, source: Source, chosen: frozenset[int]) -> None:
-        super().__init__(source, "frozen")
-        self._chosen = chosen
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; the chosen ones with the images of the last that is not chosen."""
-        shown: Frame | None = None
-        for frame in self._frames():
-            if shown is None or frame.id not in self._chosen:
-                shown = frame
-            yield replace(frame, images=shown.images, depth=shown.depth)
-
-    def frame(self, index: int) -> Frame:
-        """Return one frame; if chosen, with the images of the last that is not."""
-        frame = self._inside.frame(index)
-        shown = frame
-        while shown.id in self._chosen and index > 0:
-            index -= 1
-            shown = self._inside.frame(index)
-        return replace(frame, images=shown.images, depth=shown.depth)
-
-
-class _Dropped(_Wrapper):
-    """Frames left out."""
-
-    def __init__(self, source: Source, chosen: frozenset[int]) -> None:
-        super().__init__(source, "dropped")
-        self._chosen = chosen
-        self._kept = np.flatnonzero([i not in chosen for i in super().ids.tolist()])
-        if isinstance(source, RandomAccess):
-            self.stamps_ns = source.stamps_ns[self._kept]
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    @property
-    def ids(self) -> NDArray[np.int_]:
-        """(N,) ids of the frames that are left."""
-        return super().ids[self._kept]
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames that are left."""
-        waiting: list[ImuSamples] = []
-        for frame in self._frames():
-            if frame.imu is not None:
-                waiting.append(frame.imu)
-            if frame.id not in self._chosen:
-                yield replace(frame, imu=ImuSamples.joined(waiting)) if waiting else frame
-                waiting = []
-
-    def frame(self, index: int) -> Frame:
-        """Return one of the frames that are left, with the samples of those dropped before it.
-
-        Raises:
-            UnusableFrame: it, or one dropped before it, cannot be read.
-        """
-        first = int(self._kept[index - 1]) + 1 if index > 0 else 0
-        last = int(self._kept[index])
-        frames = [self._inside.frame(place) for place in range(first, last + 1)]
-        waiting = [frame.imu for frame in frames if frame.imu is not None]
-        return replace(frames[-1], imu=ImuSamples.joined(waiting)) if waiting else frames[-1]
-
-
-class _Replayed(_Wrapper):
-    """Frames in another order, at other times."""
-
-    def __init__(
-        self,
-        source: RandomAccess,
-        how: str,
-        order: NDArray[np.int_],
-        stamps_ns: NDArray[np.int64],
-        truth: Trajectory | None,
-    ) -> None:
-        super().__init__(source, how)
-        self.rig = source.rig.without_imu()
-        self.truth = truth
-        self.stamps_ns = stamps_ns
-        self._order = order
-
-    @property
-    def ids(self) -> NDArray[np.int_]:
-        """(N,) ids of the frames."""
-        return np.arange(len(self))
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames in their new order."""
-        self.skipped = skipped = []
-        for place in range(len(self)):
-            try:
-                yield self.frame(place)
-            except UnusableFrame as error:
-                skipped.append(error.skipped)
-
-    def frame(self, index: int) -> Frame:
-        """Return the frame that is played at a place."""
-        stamp_ns = int(self.stamps_ns[index])
-        try:
-            frame = self._inside.frame(int(self._order[index]))
-        except UnusableFrame as error:
-            raise UnusableFrame(replace(error.skipped, stamp_ns=stamp_ns)) from error
-        return replace(frame, id=index, stamp_ns=stamp_ns, imu=None)
