@@ -69,7 +69,8 @@ def _row(seed: int, sensors: str, poses: str, frames: int) -> dict[str, object]:
     print(
         f"room {seed} {sensors:7}{poses:9} voxel {made.config.voxel:g} m to "
         f"{made.config.max_depth:.1f} m, {made.keyframes} keyframes, "
-        f"{len(surface.faces)} triangles in {made.seconds:.1f} s ({time.perf_counter() - start:.0f} s in all): {quality}",
+        f"{len(surface.faces)} triangles in {made.seconds:.1f} s "
+        f"({time.perf_counter() - start:.0f} s in all): {quality}",
         flush=True,
     )
     return {"seed": seed, "sensors": sensors, "poses": poses, **vars(quality)}

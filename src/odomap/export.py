@@ -116,7 +116,11 @@ def export(
         >>> export("runs/desk", mesh="desk.ply", voxel=0.01)  # doctest: +SKIP
     """
     from odomap.maps.depthviews import depth_views
+    from odomap.maps.tsdf import TsdfConfig
 
+    for name, value in (("voxel", voxel), ("max_depth", max_depth)):
+        if value is not None:
+            TsdfConfig(**{name: value})  # a wrong value is said before anything is opened
     tell = progress or (lambda done, total, text: None)
     folder = Path(run)
     files = _files(folder, cloud, mesh)
