@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from odomap.files.trajectories import read_trajectory, read_tum, write_tum
 from odomap.sensors.rig import DepthMount
 from odomap.sources.describe import describe
 from odomap.sources.disturb import there_and_back
+from odomap.sources.folder import FolderSource
 from odomap.sources.images import decode, find_mosaic
 from odomap.sources.open import open as open_source
 from odomap.sources.tum import TumSource
@@ -105,6 +107,28 @@ def test_tum_with_the_factor_of_another_camera(data_folder: Path) -> None:
     wrong = replace(rig, depth=DepthMount("rgb", 1000.0))
     (note,) = TumSource(data_folder / "rgbd_desk", wrong).notes
     assert "with factor 1000: is it 5000" in note
+
+
+def test_the_same_images_as_a_folder_and_as_a_video(data_folder: Path, tmp_path: Path) -> None:
+    desk = TumSource(data_folder / "rgbd_desk")
+    rig = data_folder / "rgbd_desk" / "rig.yaml"
+    folder = open_source(data_folder / "rgbd_desk" / "rgb", rig)
+    assert isinstance(folder, FolderSource)
+    # The names of its images are times.
+    assert folder.stamps_ns.tolist() == desk.stamps_ns.tolist()
+    np.testing.assert_array_equal(folder.frame(9).images[0], desk.frame(9).images[0])
+    file = tmp_path / "desk.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 30, (640, 480))
+    for index in range(40):
+        writer.write(cv2.cvtColor(desk.colour(index), cv2.COLOR_RGB2BGR))
+    writer.release()
+    video = open_source(file, rig)
+    frames = list(video)
+    assert len(frames) == 40
+    for frame in frames[::8]:
+        gap = frame.images[0].astype(float) - desk.frame(frame.id).images[0]
+        assert np.abs(gap).mean() < 4
+    assert np.abs(video.colour(30).astype(float) - desk.colour(30)).mean() < 8
 
 
 def test_no_real_image_is_taken_for_a_mosaic(data_folder: Path) -> None:
