@@ -143,7 +143,7 @@ def test_a_third_coefficient_is_found() -> None:
 def test_covariances_are_honest(lens: Camera) -> None:
     """Errors over their covariance are χ² of as many degrees as there are numbers."""
     scores = []
-    for seed in range(12):
+    for seed in range(8):
         pixels = look(lens, poses(lens, seed), 0.2, seed)
         found = calibrate_camera(BOARD.points, pixels, SIZE, lens.model)
         error = numbers(found.cameras[0]) - numbers(lens)
@@ -273,8 +273,7 @@ def test_boards_in_one_place_mean_nothing() -> None:
 
 
 def test_boards_that_are_never_tilted_mean_nothing() -> None:
-    found = calibrate_camera(BOARD.points, look(RADTAN, poses(RADTAN, tilt=0.0), 0.1), SIZE)
-    # Facing the camera from all over the image, boards still turn: hold them parallel to it.
+    # Facing the camera from all over the image, boards would still turn: hold them parallel to it.
     flat = poses(RADTAN)
     flat[:, :3, :3] = np.eye(3)
     flat[:, :3, 3] -= flat[:, :3, :3] @ (BOARD.points.mean(axis=0))

@@ -47,11 +47,11 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_VIEWS = 3
-START_VIEWS = 12
+START_VIEWS = 8
 """Views, spread over all, by which starts are judged."""
 CLOSE_SECOND = 2.0
 """A second start is tried if boards fit it at most so much worse than the first."""
-FOCAL_LADDER = np.geomspace(0.15, 2.0, 12)
+FOCAL_LADDER = np.geomspace(0.15, 2.0, 9)
 SIGMA_FLOOR_PX = 0.005
 """Corners are not better than that, even in rendered pictures."""
 MAX_ROUNDS = 4
@@ -150,7 +150,7 @@ def calibrate_camera(
     best: ArrowSolution | None = None
     for camera in _starts(points, seen[0, views], blank):
         state = _placed(points, seen, (camera,), np.eye(4)[None])
-        solution = solve_arrow(ArrowProblem(points, seen, 1.0), state)
+        solution = solve_arrow(ArrowProblem(points, seen), state, tolerance=1e-5)
         if best is None or solution.cost < best.cost:
             best = solution
     if best is None:
@@ -199,7 +199,8 @@ def calibrate_pair(
     T_left_right, seen[1] = _agreed(points, seen, cameras, symmetric)
     mounts = np.stack([np.eye(4), T_left_right])
     state = _placed(points, seen, cameras, mounts)
-    return _settled(points, seen, solve_arrow(ArrowProblem(points, seen, 1.0), state).state)
+    solution = solve_arrow(ArrowProblem(points, seen), state, tolerance=1e-5)
+    return _settled(points, seen, solution.state)
 
 
 def _checked(points_board: ArrayLike, *pixels: ArrayLike) -> tuple[Array, Array]:
@@ -239,7 +240,7 @@ def _starts(points: Array, pixels: Array, blank: Camera) -> list[Camera]:
     rated = []
     for guess in guesses:
         camera = replace(blank, intrinsics=guess)
-        errors = [pose_of_plane(points, uv, camera)[1] for uv in pixels[chosen]]
+        errors = [pose_of_plane(points, uv, camera, mirrored=False)[1] for uv in pixels[chosen]]
         # The median, so that a picture without a board in it has no say.
         rated.append((float(np.median(errors)), camera))
     rated.sort(key=lambda item: item[0])

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.errors import CalibrationError
-from odomap.geometry.camera import Camera
+from odomap.geometry.camera import MODELS, Camera
 from odomap.geometry.lie import hat, se3_exp, se3_inverse
 from odomap.geometry.robust import huber_cost, huber_weight
 
@@ -244,20 +244,12 @@ def _by_lens(camera: Camera, points: Array, uv: Array) -> Array:
     plane = (uv - camera.intrinsics[2:]) / camera.intrinsics[:2]
     out[:, 0, 0], out[:, 1, 1] = plane[:, 0], plane[:, 1]
     out[:, 0, 2] = out[:, 1, 3] = 1.0
-    for k in range(len(camera.distortion)):
-        ends, total = [], 0.0
-        for sign in (1.0, -1.0):
-            distortion = camera.distortion.copy()
-            distortion[k] += sign * 1e-6
-            try:
-                moved = replace(camera, distortion=distortion)
-            except CalibrationError:
-                # A coefficient at the end of its range has a derivative on one side.
-                ends.append(uv)
-            else:
-                ends.append(moved.project(points))
-                total += 1e-6
-        out[:, :, 4 + k] = (ends[0] - ends[1]) / max(total, 1e-6)
+    lens, step = MODELS[camera.model], 1e-6
+    # Reach is that of the lens as it is: a derivative does not ask where the model ends.
+    reach = lens.reach(camera.distortion)
+    for k, unit in enumerate(np.eye(len(camera.distortion))):
+        ends = [lens.to_plane(points, camera.distortion + h * unit, reach) for h in (step, -step)]
+        out[:, :, 4 + k] = (ends[0] - ends[1]) / (2 * step) * camera.intrinsics[:2]
     return out
 
 

@@ -108,13 +108,16 @@ def _read_off(omega: Array) -> Array | None:
     return np.array([np.sqrt(fx2), np.sqrt(fy2), -w13 / w11, -w23 / w22])
 
 
-def pose_of_plane(points_plane: ArrayLike, pixels: ArrayLike, camera: Camera) -> tuple[SE3, float]:
+def pose_of_plane(
+    points_plane: ArrayLike, pixels: ArrayLike, camera: Camera, *, mirrored: bool = True
+) -> tuple[SE3, float]:
     """Find where a camera sees known points of the plane z = 0.
 
     Args:
         points_plane: (N, 3) metres, z = 0, N ≥ 6.
         pixels: (N, 2) raw image.
         camera: the camera, at least roughly known.
+        mirrored: whether to try the pose tilted the other way, too.
 
     Returns:
         T_camera_plane, and the root mean square reprojection error in pixels; infinite where no
@@ -134,7 +137,8 @@ def pose_of_plane(points_plane: ArrayLike, pixels: ArrayLike, camera: Camera) ->
     if start is None:
         return SE3.identity(), np.inf
     best, least = start, _error(start, points, uv, camera)
-    for guess in (start, _tilted_back(start, points.mean(axis=0))):
+    guesses = [start, _tilted_back(start, points.mean(axis=0))] if mirrored else [start]
+    for guess in guesses:
         found = refine_pose(
             points, ahead, camera, guess.inverse(), huber=3.0
         ).T_world_camera.inverse()
