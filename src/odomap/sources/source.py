@@ -48,7 +48,8 @@ class Source(Protocol):
         skipped: what the iteration so far had to leave out; a fresh iteration starts it anew.
 
     Sources made from files also have `notes: list[str]`: what was found odd on opening and how it
-    was mended, one sentence each, for the user.
+    was mended, one sentence each, for the user. Some have `details: dict[str, Any]`: facts such as
+    the codec of a video, for `odomap info`.
     """
 
     name: str
