@@ -33,7 +33,7 @@ def shown_output(name: str) -> list[str]:
 
 
 def test_there_are_examples():
-    assert len(EXAMPLES) >= 9
+    assert len(EXAMPLES) >= 11
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -101,6 +101,17 @@ def test_pitfalls_of_tracks(capsys):
     assert length > 2.5 * results["start anew"][0]
     assert doubles < 2 < 50 < results["add anywhere"][1]
     assert cover > results["add anywhere"][2]
+
+
+def test_every_camera(capsys):
+    results = run_as_shown("10_every_camera.py", capsys)
+    assert max(results.values()) < 0.5
+
+
+def test_own_camera(capsys):
+    results = run_as_shown("11_own_camera.py", capsys)
+    assert abs(results["focal"] / 400.0 - 1.0) < 0.002
+    assert results["percent"] < 0.5
 
 
 def test_solution_of_exercise_1(tmp_path):

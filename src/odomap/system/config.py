@@ -71,7 +71,14 @@ def _mono() -> Config:
 
 
 def _rgbd() -> Config:
-    return Config(tracking=TrackingConfig(sensors="rgbd"), candidates=CandidateConfig(follow=True))
+    # Cameras with a depth image are held by hand, blur, and expose row after row: points are where
+    # the model of one instant says only to a pixel or so, and corners are faint.
+    return Config(
+        features=FeatureConfig(threshold=8),
+        tracking=TrackingConfig(sensors="rgbd"),
+        candidates=CandidateConfig(follow=True),
+        noise=NoiseConfig(position_px=1.2),
+    )
 
 
 def _stereo() -> Config:

@@ -219,10 +219,10 @@ def _error_between(start: TwoViewMotion, between: Sequence[BetweenView], camera:
     assert start.T_second_first is not None
     known = np.isfinite(start.points_first[:, 0])
     T_first_second = start.T_second_first.inverse().log()
-    errors = []
+    errors: list[float] = []
+    if not between:
+        return np.inf
     for k in np.unique(np.linspace(0, len(between) - 1, VIEWS_BETWEEN).round().astype(int)):
-        if k < 0:
-            continue
         seen = between[k].rows[known[between[k].rows]]
         pixels = between[k].pixels[known[between[k].rows]]
         if len(seen) < 10:
