@@ -141,6 +141,9 @@ def integrate_kernel(
     height, width = depth.shape
     radius = 0.5 * np.sqrt(3.0) * SIDE * voxel
     centre = np.empty(3)
+    # One voxel further along z, in the camera's axes.
+    step_x, step_y, step_z = T[0, 2] * voxel, T[1, 2] * voxel, T[2, 2] * voxel
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     for b in range(count):
         for k in range(3):
             centre[k] = T[k, 3]
@@ -157,21 +160,22 @@ def integrate_kernel(
                 Y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
                 Z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
             else:
-                X += T[0, 2] * voxel
-                Y += T[1, 2] * voxel
-                Z += T[2, 2] * voxel
+                X += step_x
+                Y += step_y
+                Z += step_z
             if Z < 0.05:
                 continue
             inverse = 1.0 / Z
-            u = pinhole[0] * X * inverse + pinhole[2]
-            v = pinhole[1] * Y * inverse + pinhole[3]
+            u, v = fx * X * inverse + cx, fy * Y * inverse + cy
             if not (u >= 0.0 and v >= 0.0 and u < width - 1.0 and v < height - 1.0):
                 continue
             near_row, near_column = int(v + 0.5), int(u + 0.5)
             z = float(depth[near_row, near_column])
+            if z == 0.0:
+                continue
             slant = slants[near_row // CELL, near_column // CELL]
             d = (z - Z) * slant
-            if z == 0.0 or slant < 0.1 or d < -1.5 * band:
+            if slant < 0.1 or d < -1.5 * band:
                 continue
             if d < 1.5 * band:
                 column, row = int(u), int(v)
@@ -179,9 +183,9 @@ def integrate_kernel(
                 z10, z11 = depth[row + 1, column], depth[row + 1, column + 1]
                 low, high = min(z00, z01, z10, z11), max(z00, z01, z10, z11)
                 if low > 0.0 and high - low <= jump * low:
-                    fx, fy = u - column, v - row
-                    upper, lower = z00 + fx * (z01 - z00), z10 + fx * (z11 - z10)
-                    z = upper + fy * (lower - upper)
+                    right, down = u - column, v - row
+                    upper, lower = z00 + right * (z01 - z00), z10 + right * (z11 - z10)
+                    z = upper + down * (lower - upper)
                     d = (z - Z) * slant
             if d < -band:
                 continue
