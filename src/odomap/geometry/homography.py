@@ -18,12 +18,15 @@ section 5.3.3.
 import numpy as np
 from numpy.typing import ArrayLike
 
+from odomap.errors import InputError
 from odomap.geometry.lie import orthonormalize
 from odomap.geometry.pose import SE3
 from odomap.geometry.so3 import Array, tail_shape
 
 __all__ = ["motions_of_homography"]
 
+_FLAT = 1e-12
+"""Ratio of squared singular values below which a matrix maps all to a line or a point."""
 _STILL = 1e-6
 """Difference of the squared singular values below which the camera only turned."""
 
@@ -36,11 +39,16 @@ def motions_of_homography(H: ArrayLike) -> list[SE3]:
 
     Returns:
         Four T_second_first, the translation in units of the plane's distance from the first camera;
-        none if the camera only turned, which says nothing about the plane.
+        none if the camera only turned, which says nothing about the plane, or if H has rank one.
+
+    Raises:
+        InputError: H is not (3, 3).
     """
     H = tail_shape(H, (3, 3), "H")
+    if H.ndim != 2:
+        raise InputError(f"H: has shape {H.shape}, give shape (3, 3)")
     values, V = np.linalg.eigh(H.T @ H)
-    if not values[1] > 0:
+    if not values[1] > _FLAT * values[2]:
         return []
     H = H / np.sqrt(values[1])
     H = H * np.sign(np.linalg.det(H))
