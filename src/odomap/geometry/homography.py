@@ -44,14 +44,13 @@ def motions_of_homography(H: ArrayLike) -> list[SE3]:
     Raises:
         InputError: H is not (3, 3).
     """
-    H = tail_shape(H, (3, 3), "H")
-    if H.ndim != 2:
-        raise InputError(f"H: has shape {H.shape}, give shape (3, 3)")
-    values, V = np.linalg.eigh(H.T @ H)
+    given = tail_shape(H, (3, 3), "H")
+    if given.ndim != 2:
+        raise InputError(f"H: has shape {given.shape}, give shape (3, 3)")
+    values, V = np.linalg.eigh(given.T @ given)
     if not values[1] > _FLAT * values[2]:
         return []
-    H = H / np.sqrt(values[1])
-    H = H * np.sign(np.linalg.det(H))
+    scaled: Array = given * np.sign(np.linalg.det(given)) / np.sqrt(values[1])
     low, _, high = values / values[1]
     if high - low < _STILL:
         return []
@@ -62,9 +61,9 @@ def motions_of_homography(H: ArrayLike) -> list[SE3]:
     motions = []
     for u in ((a * v1 + b * v3) / np.sqrt(high - low), (a * v1 - b * v3) / np.sqrt(high - low)):
         before = np.stack([v2, u, np.cross(v2, u)], axis=1)
-        after = np.stack([H @ v2, H @ u, np.cross(H @ v2, H @ u)], axis=1)
+        after = np.stack([scaled @ v2, scaled @ u, np.cross(scaled @ v2, scaled @ u)], axis=1)
         R = orthonormalize(after @ before.T)
         normal: Array = np.cross(v2, u)
-        t = (H - R) @ normal
+        t = (scaled - R) @ normal
         motions += [SE3.from_parts(R, t), SE3.from_parts(R, -t)]
     return motions

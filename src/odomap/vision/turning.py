@@ -36,6 +36,8 @@ LARGEST_SIDE_PX = 110
 STEPS = 15
 LARGEST_TURN = 0.5
 """Radians; beyond this the images hardly overlap."""
+LEAST_SLOPE = 0.01
+"""Grey levels per pixel that a turn about any axis must change; less is rounding and noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +76,14 @@ def turn_between(before: Thumbnail, now: Thumbnail) -> Array | None:
         now: the later one, of the same camera.
 
     Returns:
-        R_before_now (3, 3), or None if no turn makes the images agree better than none does.
+        R_before_now (3, 3), or None if no turn makes the images agree better than none does, or
+        the earlier one has no texture.
     """
     R, lowest = np.eye(3), np.inf
     J, H = np.empty((*before.image.shape, 3)), np.zeros((3, 3))
     _jacobian_kernel(before.image, before.intrinsics, J, H)
-    if not np.linalg.cond(H) < 1e8:
+    unit = J.shape[0] * J.shape[1] * before.intrinsics[0] ** 2
+    if not np.linalg.eigvalsh(H)[0] > LEAST_SLOPE**2 * unit:
         return None
     inverse, best, gradient = np.linalg.inv(H), np.eye(3), np.empty(3)
     for _ in range(STEPS):
@@ -167,5 +171,5 @@ def _residual_kernel(
 def warm_up() -> None:
     """Compile the kernels of this module."""
     image = np.random.default_rng(0).integers(0, 255, (24, 32)).astype(np.uint8)
-    camera = Camera(intrinsics=(30.0, 30.0, 15.5, 11.5), resolution=(32, 24))
+    camera = Camera(intrinsics=np.array([30.0, 30.0, 15.5, 11.5]), resolution=(32, 24))
     turn_between(Thumbnail.of(image, camera), Thumbnail.of(image, camera))
