@@ -80,10 +80,11 @@ def refused(cli):
 
 
 def found_in(views: BoardViews, folder: Path, model: str = "pinhole") -> CalibrationResult:
+    """Calibrate from files; the picture is drawn elsewhere, it takes as long as all the rest."""
     write_board_views(views, folder)
     if views.right_images:
-        return calibrate(folder / "left", folder / "right", model=model, out=folder)
-    return calibrate(folder, model=model, out=folder / "rig.yaml")
+        return calibrate(folder / "left", folder / "right", model=model)
+    return calibrate(folder, model=model)
 
 
 # ---- the bars: known cameras, five seeds ----
@@ -92,19 +93,18 @@ def found_in(views: BoardViews, folder: Path, model: str = "pinhole") -> Calibra
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("truth", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
 def test_rendered_boards_give_the_camera_back(truth: Camera, seed: int, tmp_path: Path) -> None:
-    result = found_in(board_views(truth, seed, 18), tmp_path, truth.model)
-    camera = read_rig(tmp_path).cameras[0].camera
-    assert camera == result.rig.cameras[0].camera
+    result = found_in(board_views(truth, seed, 16), tmp_path, truth.model)
+    camera = result.rig.cameras[0].camera
     assert np.abs(camera.intrinsics[:2] / truth.intrinsics[:2] - 1.0).max() < 2e-3
     assert np.abs(camera.intrinsics[2:] - truth.intrinsics[2:]).max() < 1.0
     assert result.calibration.rms_px[0] < 0.1
-    assert result.counts[0][2] >= 17
+    assert result.counts[0][2] >= 15
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_double_sphere_maps_every_ray_as_the_truth_does(seed: int, tmp_path: Path) -> None:
     """Its focal length trades off against xi: what counts is where rays end."""
-    result = found_in(board_views(SPHERE, seed, 18), tmp_path, "double_sphere")
+    result = found_in(board_views(SPHERE, seed, 16), tmp_path, "double_sphere")
     camera = result.rig.cameras[0].camera
     u, v = np.meshgrid(np.arange(60, 600, 20.0), np.arange(60, 440, 20.0))
     pixels = np.column_stack([u.ravel(), v.ravel()])
@@ -117,9 +117,8 @@ def test_a_double_sphere_maps_every_ray_as_the_truth_does(seed: int, tmp_path: P
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rendered_pairs_give_the_baseline_back(seed: int, tmp_path: Path) -> None:
-    views = board_views(PINHOLE, seed, 12, right=RIGHT, T_left_right=T_LEFT_RIGHT)
-    found_in(views, tmp_path)
-    left, right = read_rig(tmp_path).stereo_pair()
+    views = board_views(PINHOLE, seed, 10, right=RIGHT, T_left_right=T_LEFT_RIGHT)
+    left, right = found_in(views, tmp_path).rig.stereo_pair()
     assert left.T_body_camera == SE3.identity()
     T = right.T_body_camera
     assert np.linalg.norm(T.t) == pytest.approx(np.linalg.norm(T_LEFT_RIGHT.t), rel=2e-3)
@@ -157,12 +156,12 @@ def test_one_command_writes_a_rig_and_a_picture(cli, pictures: Path) -> None:
 
 
 def test_a_pattern_or_files_do_as_well_as_a_folder(cli, pictures: Path) -> None:
-    cli(pictures, *BOARD, "--out", "a.yaml")
-    cli(f"{pictures}/board_*.png", *BOARD, "--out", "b.yaml")
-    cli(*sorted(pictures.iterdir()), *BOARD, "--out", "c.yaml")
-    texts = {Path(name).read_text() for name in ("a.yaml", "b.yaml", "c.yaml")}
-    assert len(texts) == 1
-    assert Path("a.calibration.png").exists()
+    expected = calibrate(pictures).rig
+    assert calibrate(f"{pictures}/board_*.png").rig == expected
+    code, _, err = cli(*sorted(pictures.iterdir()), *BOARD, "--out", "phone.yaml")
+    assert code == 0, err
+    assert read_rig("phone.yaml") == expected
+    assert Path("phone.calibration.png").exists()
 
 
 def test_a_pair_is_two_folders(cli, tmp_path: Path) -> None:
@@ -187,7 +186,7 @@ def test_a_video_is_looked_through_for_views_that_differ(cli, tmp_path: Path) ->
     board = Board(9, 6, 0.025)
     corners = [(90, 70), (230, 70), (220, 175), (100, 170), (160, 120), (90, 70)]
     writer = cv2.VideoWriter("clip.avi", cv2.VideoWriter.fourcc(*"MJPG"), 15.0, (320, 240))
-    frames = 60
+    frames = 40
     for k in range(frames):
         s = (len(corners) - 1) * k / frames
         i = int(s)
@@ -203,9 +202,7 @@ def test_a_video_is_looked_through_for_views_that_differ(cli, tmp_path: Path) ->
     assert np.abs(camera.intrinsics / SMALL.intrinsics - 1).max() < 1e-2
     data = Path("clip.avi").read_bytes()
     Path("cut.avi").write_bytes(data[: int(0.7 * len(data))])
-    code, _, err = cli("cut.avi", *BOARD, "--out", "cut.yaml")
-    assert code == 0, err
-    assert "warning: cut.avi: the file is cut: it ends after" in err
+    assert "cut.avi: the file is cut: it ends after" in calibrate("cut.avi").warnings[0]
     Path("no.avi").write_bytes(b"RIFF0000AVI LIST")
     code, _, err = cli("no.avi", *BOARD, "--out", "no.yaml")
     assert code == 2

@@ -117,14 +117,11 @@ def calibrate(
         520.3
     """
     from odomap.backend.calibration_doubts import doubts
-    from odomap.geometry.camera import Camera
     from odomap.sources.pictures import open_pictures, pair_pictures
     from odomap.vision.board import Board
 
     target = board if isinstance(board, Board) else Board.parse(board, square)
-    Camera(model, (1.0, 1.0, 0.0, 0.0), _no_distortion(model), (1, 1))  # an unknown model is said
-    if k3 and model != "pinhole":
-        raise InputError(f"k3 is a coefficient of the pinhole, not of {model}")
+    _check_model(model, k3)
     file = _target_file(out) if out is not None else None
     sets = [open_pictures(_listed(given)) for given in (images, right) if given is not None]
     if len(sets) == 2:
@@ -152,8 +149,16 @@ def calibrate(
     return CalibrationResult(rig, calibration, target, names, counts, tuple(warnings), written)
 
 
-def _no_distortion(model: str) -> tuple[float, ...]:
-    return {"kannala_brandt": (0.0,) * 4, "double_sphere": (0.0, 0.5)}.get(model, ())
+def _check_model(model: str, k3: bool) -> None:
+    """Raise unless there is such a lens, before pictures are searched for it."""
+    from odomap.errors import nearest_name
+    from odomap.geometry.camera import MODELS
+
+    if model not in MODELS:
+        hint = nearest_name(model, MODELS)
+        raise CalibrationError(f"model: '{model}' is unknown{hint}; known are {', '.join(MODELS)}")
+    if k3 and model != "pinhole":
+        raise InputError(f"k3 is a coefficient of the pinhole, not of {model}")
 
 
 def _listed(given: Inputs) -> Sequence[str | Path]:
@@ -196,7 +201,7 @@ def _searched(sets: "Sequence[Pictures]", board: "Board", tell: Tell) -> list[_S
             tell(done, total, f"{picture.name}  {search.found} boards")
             done += 1
             search.names.append(picture.name)
-            corners = None
+            corners, sharp = None, 0.0
             if picture.image is None:
                 search.unreadable.append(f"{picture.name}: {picture.reason}")
             else:
@@ -205,8 +210,8 @@ def _searched(sets: "Sequence[Pictures]", board: "Board", tell: Tell) -> list[_S
                 size = guess_size(picture.image) if corners is None and index in spare else None
                 if size is not None:
                     search.sizes.append(size)
+                sharp = 0.0 if corners is None else sharpness(picture.image, corners)
             search.corners.append(corners)
-            sharp = 0.0 if corners is None else sharpness(picture.image, corners)
             search.sharp.append(sharp)
         searches.append(search)
     return searches
@@ -275,8 +280,10 @@ def _solved(
         if sizes[0] != sizes[1]:
             texts = ["{}x{}".format(*size) for size in sizes]
             raise InputError(f"pictures are {texts[0]} and {texts[1]}: a pair needs one size")
+        left, right = pixels
+        symmetric = board.is_symmetric
         return calibrate_pair(
-            board.points, *pixels, sizes, model, coefficients, symmetric=board.is_symmetric
+            board.points, left, right, sizes, model, coefficients, symmetric=symmetric
         )
     except InputError as error:
         raise type(error)(f"{where}: {error}") from error

@@ -91,7 +91,7 @@ class Calibration:
     @property
     def view_rms(self) -> Array:
         """(C, V) root mean square reprojection error in pixels, NaN where not seen."""
-        return np.sqrt(np.mean(np.sum(self.residuals**2, axis=3), axis=2))
+        return np.asarray(np.sqrt(np.mean(np.sum(self.residuals**2, axis=3), axis=2)))
 
     @property
     def rms_px(self) -> Array:
@@ -220,9 +220,10 @@ def _checked(points_board: ArrayLike, *pixels: ArrayLike) -> tuple[Array, Array]
 def _blank(model: str, num_coefficients: int, resolution: tuple[int, int]) -> Camera:
     """Return the model without distortion, at a focal length to be replaced."""
     size = float(max(resolution))
-    intrinsics = (size, size, 0.5 * (resolution[0] - 1.0), 0.5 * (resolution[1] - 1.0))
+    width, height = resolution
+    intrinsics = np.array([size, size, 0.5 * (width - 1.0), 0.5 * (height - 1.0)])
     if model in MODELS and MODELS[model].lengths == (2,):
-        return Camera(model, intrinsics, (0.0, 0.5), resolution)
+        return Camera(model, intrinsics, np.array([0.0, 0.5]), resolution)
     count = num_coefficients
     if model in MODELS and count not in MODELS[model].lengths:
         count = MODELS[model].lengths[0]
@@ -236,7 +237,7 @@ def _starts(points: Array, pixels: Array, blank: Camera) -> list[Camera]:
     guesses = [np.array([f * width, f * width, *blank.intrinsics[2:]]) for f in FOCAL_LADDER]
     if blank.model == "pinhole":
         Hs = np.stack([homography(points[:, :2], uv) for uv in pixels])
-        guesses = intrinsics_of_plane_views(Hs, blank.resolution) + guesses
+        guesses = intrinsics_of_plane_views(Hs, blank.resolution) + guesses[::3]
     rated = []
     for guess in guesses:
         camera = replace(blank, intrinsics=guess)
@@ -325,10 +326,11 @@ def _settled(points: Array, pixels: Array, state: ArrowState) -> Calibration:
         e = residuals(everything, state)
         if np.array_equal(_believed(e, seen), used):
             break
-    count = 2 * np.count_nonzero(used) * len(points)
-    free = len(solution.covariance) + 6 * np.count_nonzero(used.any(axis=0))
-    inflation = max(2.0 * solution.cost / max(count - free, 1), 1e-12)
-    Ts = np.where(used.any(axis=0)[:, None, None], state.Ts_first_board, np.nan)
+    views = np.asarray(used.any(axis=0))
+    free = len(solution.covariance) + 6 * int(np.count_nonzero(views))
+    surplus = 2 * int(np.count_nonzero(used)) * len(points) - free
+    inflation = max(2.0 * solution.cost / max(surplus, 1), 1e-12)
+    Ts = np.where(views[:, None, None], state.Ts_first_board, np.nan)
     return Calibration(
         cameras=state.cameras,
         T_left_right=SE3(state.Ts_first_camera[1]) if len(state.cameras) > 1 else None,

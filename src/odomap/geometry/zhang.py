@@ -125,7 +125,7 @@ def pose_of_plane(
     """
     points, uv = tail_shape(points_plane, (3,), "points_plane"), tail_shape(pixels, (2,), "pixels")
     rays = camera.unproject(uv)
-    seen = np.isfinite(rays).all(axis=1)
+    seen = np.asarray(np.isfinite(rays).all(axis=1))
     # The refinement works on x/z: what a fisheye sees beside or behind itself has no say there.
     ahead = np.where((rays[:, 2:] > 0.1) & seen[:, None], uv, np.nan)
     if np.count_nonzero(seen) < 6:

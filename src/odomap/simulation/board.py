@@ -199,19 +199,20 @@ def write_board_views(views: BoardViews, folder: str | Path) -> Path:
     """
     import cv2
 
-    from odomap.files.atomic import make_folder, write_bytes
-
     root = Path(folder)
     places = [(root / "left" if views.right_images else root, views.images)]
     if views.right_images:
         places.append((root / "right", views.right_images))
     for place, images in places:
-        make_folder(place)
         for k, image in enumerate(images):
             ok, png = cv2.imencode(".png", image)
             if not ok:
                 raise OutputError(f"{place}: picture {k} cannot be encoded as PNG")
-            write_bytes(place / f"board_{k:03d}.png", png.tobytes())
+            try:
+                place.mkdir(parents=True, exist_ok=True)
+                (place / f"board_{k:03d}.png").write_bytes(png.tobytes())
+            except OSError as error:
+                raise OutputError(f"{place}: cannot be written: {error.strerror}") from error
     return root
 
 

@@ -56,7 +56,8 @@ def _scatter(ax: Axes, calibration: Calibration, c: int, role: str) -> None:
     title = f"{role}{camera.model}, reprojection error {rms:.3f} px RMS"
     dress(ax, title, "x [px]", "y [px]")
     order = np.argsort(away, kind="stable")
-    ax.scatter(*r[order].T, c=away[order], cmap=ERROR_COLOURS, s=7, alpha=0.6, lw=0, label="corner")
+    x, y = r[order].T
+    ax.scatter(x, y, s=7, c=away[order], cmap=ERROR_COLOURS, alpha=0.6, lw=0, label="corner")
     limit = max(float(np.percentile(np.abs(r), 99.5)) * 1.25, 3.2 * calibration.sigma_px)
     for k, style in ((1, "-"), (3, "--")):
         radius, label = k * calibration.sigma_px, f"{k}σ = {k * calibration.sigma_px:.3g} px"
@@ -146,10 +147,11 @@ def _arrows(ax: Axes, calibration: Calibration, c: int) -> None:
     size = CELLS[0] * CELLS[1]
     counts = np.bincount(index, minlength=size)
     enough = counts >= 3
-    mean = np.stack([np.bincount(index, r[:, k], size)[enough] for k in (0, 1)], axis=1)
-    mean /= counts[enough, None]
-    place = np.stack([np.bincount(index, uv[:, k], size)[enough] for k in (0, 1)], axis=1)
-    place /= counts[enough, None]
+    share = 1.0 / counts[enough]
+    mean, place = (
+        np.stack([np.bincount(index, a[:, k], size)[enough] * share for k in (0, 1)], axis=1)
+        for a in (r, uv)
+    )
     longest = float(np.percentile(np.linalg.norm(mean, axis=1), 95)) if len(mean) else 1.0
     factor = _round_number(0.9 * width / CELLS[0] / max(longest, 1e-9))
     dress(ax, f"Mean residual by place, {factor:g} times enlarged", "x [px]", "y [px]")

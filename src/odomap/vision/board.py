@@ -100,7 +100,8 @@ class Board:
     def points(self) -> Array:
         """(columns * rows, 3) corners on the plane z = 0, metres, row after row; read-only."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        points = self.square * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+        grid = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float64)
+        points: Array = self.square * grid
         points.setflags(write=False)
         return points
 
