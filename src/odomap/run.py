@@ -14,7 +14,7 @@ trajectory.tum, byte for byte: nothing on the way to it reads a clock.
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -236,8 +236,8 @@ def _track(
     interrupt: threading.Event,
 ) -> "Result":
     """Track frame after frame until the source, the limit or the user ends it."""
-    total = _expected(source, max_frames)
-    for frame in source:
+    total, frames = _expected(source, max_frames), iter(source)
+    for frame in frames:
         start = time.perf_counter()
         estimate = system.worker.advance(frame)
         logbook.add(frame, estimate, time.perf_counter() - start)
@@ -247,6 +247,8 @@ def _track(
         tell(Progress("tracking", done, total, estimate, logbook.frames_per_second))
         if interrupt.is_set() or done == max_frames:
             break
+    if isinstance(frames, Generator):
+        frames.close()  # a camera is let go, and says what there is to say of it
     return system.finish()
 
 
@@ -302,8 +304,8 @@ def _metrics(
     metrics["ate"] = None
     if source.truth is not None:
         try:
-            align = "se3" if result.is_metric else "sim3"
-            found = ate(result.trajectory, result.truth(source.truth), align)
+            truth = result.truth(source.truth)
+            found = ate(result.trajectory, truth, "se3" if result.is_metric else "sim3")
         except InputError as error:
             warnings.append(f"no comparison with the ground truth: {error}")
         else:

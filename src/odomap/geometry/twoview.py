@@ -38,6 +38,7 @@ __all__ = [
     "homography_ransac",
     "motions_of_essential",
     "recover_pose",
+    "refine_motion",
     "relative_pose",
     "sampson_distance",
     "sampson_jacobian",
@@ -256,9 +257,24 @@ def relative_pose(
 
 
 def _refined(E: Array, first: Array, second: Array, threshold: float) -> SE3:
-    """Minimise the Sampson distances over the motion; the threshold is taken for 2.5 σ."""
-    motion, _ = recover_pose(E, first, second)
-    scale = 2.5 / threshold
+    return refine_motion(recover_pose(E, first, second)[0], first, second, threshold)
+
+
+def refine_motion(
+    T_second_first: SE3, first: ArrayLike, second: ArrayLike, threshold: float
+) -> SE3:
+    """Minimise the Sampson distances of matches over the motion, with Huber's loss.
+
+    Args:
+        T_second_first: the start, its translation of length 1.
+        first: (N, 2) normalised image coordinates.
+        second: (N, 2).
+        threshold: largest distance of an inlier, taken for 2.5 σ.
+
+    Returns:
+        The motion at the nearest minimum, its translation of length 1.
+    """
+    motion, scale = T_second_first, 2.5 / threshold
 
     def linearise(T: SE3) -> tuple[Array, Array]:
         distance = sampson_distance(essential_matrix(T), first, second)

@@ -48,12 +48,12 @@ SAME_US = 2
 def quiet() -> Iterator[None]:
     """Keep OpenCV and FFmpeg from printing what the caller says better."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    level = cv2.getLogLevel()
+    cv2.setLogLevel(0)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        cv2.setLogLevel(level)
 
 
 def open_file(path: Path, *options: int) -> cv2.VideoCapture:

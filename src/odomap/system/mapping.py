@@ -114,7 +114,7 @@ class WindowMapper:
 
     def _drift(self, keyframe_id: int) -> Drift:
         """Return a keyframe's drift; where odometry began, what the tracker said of it."""
-        begun = Drift(self._map.covariance(keyframe_id), np.zeros((3, 6)))
+        begun = Drift.begun(self._map.covariance(keyframe_id))
         return self._drifts.get(keyframe_id, begun)
 
     def _make_bundle(self, snapshot: Snapshot) -> Bundle:
@@ -181,7 +181,10 @@ class WindowJob:
         anchor = int(np.flatnonzero(self.snapshot.is_fixed)[-1])
         Ts = solution.Ts_world_body
         T_newest_anchor = se3_inverse(Ts[newest]) @ Ts[anchor]
-        drift = self.anchor_drift.onwards(T_newest_anchor, solution, newest, self.overlap)
+        scale_drifts = not (self.bundle.is_scale_free or np.isfinite(self.bundle.disparity).any())
+        drift = self.anchor_drift.onwards(
+            T_newest_anchor, solution, newest, self.overlap, scale_drifts
+        )
         newest_id = int(self.snapshot.keyframe_ids[newest])
         return WindowChange(self.mapper, update, newest_id, drift, self.leaving, solution)
 

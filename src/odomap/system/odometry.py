@@ -155,7 +155,7 @@ class MonocularVO(Odometry):
         camera: its lens; the first image of a frame is looked at.
         config: sections for all parts; default the preset "mono".
         rhythm: which thread runs what; see `worker`.
-        T_body_camera: its mount on a rig, which a result tells; poses are the camera's all the same.
+        T_body_camera: its mount on a rig, which a result tells; poses are the camera's anyway.
 
     Raises:
         ConfigError: if there is no such rhythm.

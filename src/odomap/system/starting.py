@@ -9,7 +9,7 @@ the landmarks. The views between the two are placed when there are landmarks to 
 Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces", ISMAR 2007.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,7 @@ from odomap.system.keyframing import Keyframes
 from odomap.system.path import Placed
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.vision.bootstrap import BetweenView, TwoViewMotion, two_view_motion
+from odomap.vision.turning import Thumbnail, turn_between
 
 __all__ = ["OneViewStart", "Start", "Started", "TwoViewsStart", "Waiting"]
 
@@ -35,6 +36,8 @@ Index = NDArray[np.int64]
 
 MOST_BETWEEN = 60
 """Frames between the two views that are remembered, and placed afterwards."""
+MORE_PARALLAX = 1.2
+"""By how much the parallax must grow before two views are tried again."""
 LEAST_PARALLAX = 3.0
 """Standard deviations of a point's position; with less parallax it has no depth yet."""
 
@@ -145,11 +148,12 @@ class TwoViewsStart:
         self._map, self._eye, self._keyframes = map, eye, keyframes
         self._association, self._config = association, config
         self._first: View | None = None
+        self._last: View | None = None
         self._corners, self._descriptors = np.empty((0, 2)), np.empty((0, 0), np.uint8)
         self._pixels, self._alive = np.empty((0, 2)), np.empty(0, np.int64)
         self._flow = np.empty((0, 2))
         self._between: list[_Between] = []
-        self._depth = 1.0
+        self._depth, self._needed_px = 1.0, config.bootstrap.min_parallax_px
 
     def forget(self) -> None:
         """Drop the first view."""
@@ -166,12 +170,13 @@ class TwoViewsStart:
             again = self._look(view)
             return Waiting(f"the view changed before the motion was known; {again.reason}")
         first, second = self._corners[self._alive], self._pixels
-        found = two_view_motion(
-            first, second, self._eye.camera, self._config.bootstrap, frame.id, self._views()
-        )
+        config = replace(self._config.bootstrap, min_parallax_px=self._needed_px)
+        found = two_view_motion(first, second, self._eye.camera, config, frame.id, self._views())
         if found.T_second_first is None:
             self._between.append(_Between(frame.stamp_ns, self._alive, self._pixels))
             self._between = self._between[-MOST_BETWEEN:]
+            if found.parallax_px >= self._needed_px:  # tried in vain: views farther apart say more
+                self._needed_px = MORE_PARALLAX * found.parallax_px
             return Waiting(found.reason)
         return self._start(frame, view, T_world_body, covariance, *self._adjusted(found))
 
@@ -181,7 +186,8 @@ class TwoViewsStart:
         self._corners, self._descriptors = self._association.extend(view, np.empty((0, 2)), wanted)
         self._pixels, self._alive = self._corners, np.arange(len(self._corners))
         self._flow = np.zeros_like(self._pixels)
-        self._first, self._between = view, []
+        self._first, self._last, self._between = view, view, []
+        self._needed_px = self._config.bootstrap.min_parallax_px
         needed = 2 * self._config.bootstrap.min_points
         if len(self._corners) < needed:
             self._first = None
@@ -190,13 +196,32 @@ class TwoViewsStart:
         return Waiting("a first view is taken: move the camera sideways")
 
     def _follow(self, first: View, view: View) -> None:
-        """Find the corners that are still alive, from where they were last."""
-        known = self._corners[self._alive], self._descriptors[self._alive]
-        still = np.tile(np.eye(2), (len(self._alive), 1, 1))
-        guess = self._pixels + self._flow
-        pixels, found = self._association.find(first, *known, view, guess, still)
+        """Find the corners still alive: where they were heading, else as the image turned."""
+        pixels, found = self._find(first, view, self._pixels + self._flow, self._alive)
+        lost = np.flatnonzero(~found)
+        turned = self._turned(view)
+        if lost.size and turned is not None:
+            pixels[lost], found[lost] = self._find(first, view, turned[lost], self._alive[lost])
+        self._last = view
         self._flow = (pixels - self._pixels)[found]
         self._pixels, self._alive = pixels[found], self._alive[found]
+
+    def _find(
+        self, first: View, view: View, guess: Array, corners: Index
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        still = np.tile(np.eye(2), (len(corners), 1, 1))
+        known = self._corners[corners], self._descriptors[corners]
+        return self._association.find(first, *known, view, guess, still)
+
+    def _turned(self, view: View) -> Array | None:
+        """Return where the corners would be if the camera had only turned since the last view."""
+        assert self._last is not None
+        camera = self._eye.camera
+        before, now = (Thumbnail.of(v.pyramid[-1], camera) for v in (self._last, view))
+        R_before_now = turn_between(before, now)
+        if R_before_now is None:
+            return None
+        return camera.project(camera.unproject(self._pixels) @ R_before_now)
 
     def _views(self) -> list[BetweenView]:
         """Return the views between as rows of the corners alive now."""

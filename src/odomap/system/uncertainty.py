@@ -9,6 +9,11 @@ Spans of one window each are chained, not neighbouring keyframes: consecutive st
 landmarks and so their errors, which a sum over every step would count again and again. f is the
 variance factor found in the residuals times a factor for errors that observations share.
 
+Scale. A single camera passes the scale on from window to window, in the landmarks. If the length of
+a step is off by some share, so is all that follows. So errors live in the similarities: Ad and Σ
+are those of Sim(3), and a window without measured depth adds the error of its length |t|,
+ε = uᵀ S_t u / |t|² with u = t / |t|, as a scale that the poses after it inherit.
+
 Calibration. No amount of data averages out what the rig says wrongly. An error δ of all inverse
 depths, an offset or a slope across the image, moves the newest keyframe by k_k (the solver's
 response) given a, along the path by g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another
@@ -28,7 +33,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.bundle import BundleSolution
 from odomap.geometry.camera import Camera
-from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.geometry.lie import se3_adjoint, se3_inverse, sim3_adjoint
 
 __all__ = ["Calibration", "Drift", "NoiseConfig"]
 
@@ -53,7 +58,7 @@ class Drift:
     """How unsure a keyframe's pose in the world is, apart from what is not random.
 
     Attributes:
-        covariance: (6, 6) due to noise, right tangent.
+        covariance: (7, 7) due to noise, right tangent of Sim(3): translation, rotation, log scale.
         responses: (3, 6) motion of the pose per 1/m of error in all measured inverse depths: an
             offset, a slope in x, a slope in y of the normalised image.
     """
@@ -61,8 +66,18 @@ class Drift:
     covariance: Array
     responses: Array
 
+    @staticmethod
+    def begun(covariance: Array) -> "Drift":
+        """Return that of a first keyframe, (6, 6); the scale begins here."""
+        return Drift(np.pad(covariance, (0, 1)), np.zeros((3, 6)))
+
     def onwards(
-        self, T_newest_anchor: Array, solution: BundleSolution, newest: int, overlap: float
+        self,
+        T_newest_anchor: Array,
+        solution: BundleSolution,
+        newest: int,
+        overlap: float,
+        scale_drifts: bool,
     ) -> "Drift":
         """Return the drift of a window's newest keyframe, this being that of its anchor.
 
@@ -71,12 +86,17 @@ class Drift:
             solution: of the window.
             newest: its row in the solution.
             overlap: factor for errors that observations share.
+            scale_drifts: whether nothing in the window measures its size.
         """
-        Ad = se3_adjoint(T_newest_anchor)
-        factor = overlap * solution.variance_factor
+        Ad = sim3_adjoint(T_newest_anchor)
+        to_tangent = np.eye(7, 6)
+        t = T_newest_anchor[:3, 3]  # the anchor as the newest keyframe sees it
+        if scale_drifts and t @ t > 0:
+            to_tangent[6, :3] = -t / (t @ t)
+        S = overlap * solution.variance_factor * solution.covariances[newest]
         return Drift(
-            Ad @ self.covariance @ Ad.T + factor * solution.covariances[newest],
-            self.responses @ Ad.T + solution.disparity_responses[newest],
+            Ad @ self.covariance @ Ad.T + to_tangent @ S @ to_tangent.T,
+            self.responses @ Ad[:6, :6].T + solution.disparity_responses[newest],
         )
 
 
@@ -119,5 +139,5 @@ class Calibration:
         mount = (se3_adjoint(se3_inverse(T_world_body)) - np.eye(6)) @ self.Ad_body_camera[:, 3:]
         errors = self.inverse_depth[:, None] * drift.responses
         return np.asarray(
-            drift.covariance + errors.T @ errors + self.direction**2 * mount @ mount.T
+            drift.covariance[:6, :6] + errors.T @ errors + self.direction**2 * mount @ mount.T
         )

@@ -17,7 +17,7 @@ Reference: Mur-Artal, Montiel, Tard√≥s, "ORB-SLAM", T-RO 2015, section IV; Nist√
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from odomap.geometry.triangulate import triangulate
 from odomap.geometry.twoview import (
     essential_matrix,
     homography_ransac,
+    refine_motion,
     relative_pose,
     sampson_distance,
 )
@@ -83,6 +84,7 @@ class TwoViewMotion:
         T_second_first: the motion, translation of length 1; None if there is none to trust.
         points_first: (N, 3) in first-camera axes and units of the baseline; NaN for outliers.
         parallax: (N,) rad.
+        parallax_px: median displacement that no rotation explains.
         is_plane: whether the motion came from a homography.
         reason: why there is none, for people.
     """
@@ -90,6 +92,7 @@ class TwoViewMotion:
     T_second_first: SE3 | None
     points_first: Array
     parallax: Array
+    parallax_px: float
     is_plane: bool
     reason: str
 
@@ -139,7 +142,7 @@ def two_view_motion(
     turned = camera.fx * rotation_parallax(first, second)
     if turned < config.min_parallax_px:
         wait = f"parallax of {turned:.1f} px, {config.min_parallax_px:g} px needed"
-        return _none(len(first), f"{wait}: move the camera sideways")
+        return _none(len(first), f"{wait}: move the camera sideways", turned)
     threshold = config.max_error_px / camera.fx
     starts = [
         _judged(T, is_plane, first, second, threshold)
@@ -148,11 +151,12 @@ def two_view_motion(
     starts = sorted(starts, key=_explained, reverse=True)
     if not starts or _explained(starts[0]) < config.min_points:
         count = _explained(starts[0]) if starts else 0
-        return _none(len(first), f"{count} points of {config.min_points} fit one motion")
+        why = f"{count} points of {config.min_points} fit one motion"
+        return _none(len(first), why, turned)
     best = _decided(starts, between, camera, config)
     if best is None:
-        return _none(len(first), "two motions explain the views: a plane? Move on")
-    return best
+        return _none(len(first), "two motions explain the views: a plane? Move on", turned)
+    return replace(best, parallax_px=turned)
 
 
 def _motions(first: Array, second: Array, threshold: float, seed: int) -> list[tuple[SE3, bool]]:
@@ -167,7 +171,9 @@ def _motions(first: Array, second: Array, threshold: float, seed: int) -> list[t
         for T in motions_of_homography(plane.model):
             length = np.linalg.norm(T.t)
             if length > 1e-3:
-                motions.append((SE3.from_parts(T.R, T.t / length), True))
+                T = SE3.from_parts(T.R, T.t / length)
+                # Off the plane a motion made from it is only near one that fits: go there.
+                motions.append((refine_motion(T, first, second, threshold), True))
     return motions
 
 
@@ -178,7 +184,7 @@ def _judged(T: SE3, is_plane: bool, first: Array, second: Array, threshold: floa
     found = triangulate(poses, np.where(near[:, None], np.stack([first, second]), np.nan))
     good = near & found.ahead & (found.errors <= threshold)
     points = np.where(good[:, None], found.points_world, np.nan)
-    return TwoViewMotion(T, points, np.where(good, found.parallax, 0.0), is_plane, "")
+    return TwoViewMotion(T, points, np.where(good, found.parallax, 0.0), 0.0, is_plane, "")
 
 
 def _explained(start: TwoViewMotion) -> int:
@@ -240,5 +246,6 @@ def _rays(xy: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def _none(count: int, reason: str) -> TwoViewMotion:
-    return TwoViewMotion(None, np.full((count, 3), np.nan), np.zeros(count), False, reason)
+def _none(count: int, reason: str, parallax_px: float = 0.0) -> TwoViewMotion:
+    nowhere = np.full((count, 3), np.nan)
+    return TwoViewMotion(None, nowhere, np.zeros(count), parallax_px, False, reason)
