@@ -33,7 +33,7 @@ def calibration_figure(calibration: Calibration, names: tuple[tuple[str, ...], .
     """
     count = len(calibration.cameras)
     figure = new_figure(12.0, 7.4 * count)
-    figure.subplots_adjust(bottom=0.07 / count + 0.01, top=1 - 0.045 / count)
+    figure.subplots_adjust(left=0.075, bottom=0.07 / count + 0.01, top=1 - 0.045 / count)
     grid = figure.subplots(2 * count, 2, gridspec_kw={"wspace": 0.15, "hspace": 0.3})
     roles = ("left camera: ", "right camera: ") if count > 1 else ("",)
     for c, role in enumerate(roles):
@@ -68,6 +68,7 @@ def _scatter(ax: Axes, calibration: Calibration, c: int, role: str) -> None:
     ax.set_aspect("equal", adjustable="box", anchor="W")
     ax.set_xlim(-limit, limit)
     ax.set_ylim(limit, -limit)
+    ax.locator_params(nbins=5)
     outside = int(np.count_nonzero(np.abs(r).max(axis=1) > limit))
     text = "blue: near the centre,\nred: far from it"
     text += f"\n{outside} beyond the axes" if outside else ""
