@@ -179,7 +179,7 @@ class Keyframes:
         ids = np.concatenate([seen.landmark_ids, new])
         rows = np.concatenate([np.arange(n), n + placed])
         self._map.add_observations(keyframe_id, ids, rows)
-        history = self._history(keyframe_id, seen)
+        history = self._history(keyframe_id, seen, placed)
         self._observed_before(new, history.at(placed))
         keypoints = features.keypoints.astype(np.float64)
         keypoints[:n] = seen.pixels
@@ -247,7 +247,7 @@ class Keyframes:
         pixels, kept = self._sights.align(view, T_world_body, points, *first, pixels)
         return pixels, np.where(kept, first[0], -1), np.where(kept[:, None], first[1], pixels)
 
-    def _history(self, keyframe_id: int, seen: Seen) -> Candidates:
+    def _history(self, keyframe_id: int, seen: Seen, placed: Index) -> Candidates:
         """Return all rows beyond the tracked ones as candidates, seen in this keyframe too."""
         n, old = len(seen.pixels), seen.followed.history
         keypoints = seen.features.keypoints[n:].astype(np.float64)
@@ -258,12 +258,13 @@ class Keyframes:
         keyframes[:c], rows[:c] = old.keyframes, old.rows
         known = keyframes[:, 0] >= 0
         first_at[:c][known[:c]] = old.first_at[known[:c]]
-        # One that has been followed for long enough starts afresh here.
+        # One that has been followed for long enough starts afresh here, unless it has a place now.
         full = keyframes[:, -1] >= 0
+        full[placed] = False
         keyframes[full], rows[full], first_at[full] = -1, -1, keypoints[full]
-        at = np.argmax(keyframes < 0, axis=1)
-        keyframes[np.arange(len(at)), at] = keyframe_id
-        rows[np.arange(len(at)), at] = n + np.arange(len(at))
+        room = np.flatnonzero(keyframes[:, -1] < 0)
+        at = np.argmax(keyframes[room] < 0, axis=1)
+        keyframes[room, at], rows[room, at] = keyframe_id, n + room
         return Candidates(keypoints, seen.features.descriptors[n:], first_at, keyframes, rows)
 
     def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:

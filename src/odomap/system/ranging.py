@@ -191,7 +191,7 @@ class DepthRanger:
         return inverse_depth_at(depth, self.eye.to_raw(keypoints), self.config)
 
     def check(self, frame: Frame, view: View, points: Array) -> None:
-        """Raise if there is hardly any depth.
+        """Raise if hardly any depth can be believed.
 
         Raises:
             CalibrationError: depth lies outside what the sensor can measure.
@@ -200,7 +200,7 @@ class DepthRanger:
         assert depth is not None, "missing() says so first"
         known = depth[depth > 0]
         believed = (known >= self.config.nearest) & (known <= self.config.farthest)
-        if known.size > 0.05 * depth.size and believed.mean() < 0.05:
+        if known.size > 0.05 * depth.size and believed.mean() < 0.2:
             raise CalibrationError(
                 f"depth: {100 * (1 - believed.mean()):.0f} % of the values lie outside "
                 f"{self.config.nearest:g} to {self.config.farthest:g} m (median "

@@ -153,7 +153,7 @@ class TwoViewsStart:
         self._pixels, self._alive = np.empty((0, 2)), np.empty(0, np.int64)
         self._flow = np.empty((0, 2))
         self._between: list[_Between] = []
-        self._depth, self._needed_px = 1.0, config.bootstrap.min_parallax_px
+        self._needed_px = config.bootstrap.min_parallax_px
 
     def forget(self) -> None:
         """Drop the first view."""
@@ -172,13 +172,15 @@ class TwoViewsStart:
         first, second = self._corners[self._alive], self._pixels
         config = replace(self._config.bootstrap, min_parallax_px=self._needed_px)
         found = two_view_motion(first, second, self._eye.camera, config, frame.id, self._views())
-        if found.T_second_first is None:
+        started: Started | Waiting = Waiting(found.reason)
+        if found.T_second_first is not None:
+            started = self._start(frame, view, T_world_body, covariance, *self._adjusted(found))
+        if isinstance(started, Waiting):
             self._between.append(_Between(frame.stamp_ns, self._alive, self._pixels))
             self._between = self._between[-MOST_BETWEEN:]
             if found.parallax_px >= self._needed_px:  # tried in vain: views farther apart say more
                 self._needed_px = MORE_PARALLAX * found.parallax_px
-            return Waiting(found.reason)
-        return self._start(frame, view, T_world_body, covariance, *self._adjusted(found))
+        return started
 
     def _look(self, view: View) -> Waiting:
         """Take a view as the first."""
@@ -278,7 +280,7 @@ class TwoViewsStart:
         good = np.isfinite(points[:, 0]) & (points[:, 2] > 0) & (in_second[:, 2] > 0)
         if good.sum() < self._config.bootstrap.min_points:
             return Waiting(f"{good.sum()} points of {self._config.bootstrap.min_points} agree")
-        scale = self._depth / float(np.median(in_second[good, 2]))
+        scale = self._usual_depth() / float(np.median(in_second[good, 2]))
         T_body_camera, T_camera_body = self._eye.T_body_camera, se3_inverse(self._eye.T_body_camera)
         T_first_second = np.array(T_first_second)
         T_first_second[:3, 3] *= scale
@@ -301,6 +303,17 @@ class TwoViewsStart:
         placed.append(Placed(frame.stamp_ns, second.keyframe_id, np.eye(4), np.zeros((6, 6))))
         self.forget()
         return Started(second, tuple(placed), len(second.landmark_ids))
+
+    def _usual_depth(self) -> float:
+        """Return the median depth of the last keyframe's landmarks; 1 before there is one."""
+        known = self._map.keyframe_ids
+        if not known.size:
+            return 1.0
+        last = int(known[-1])
+        T = self._map.T_world_body(last) @ self._eye.T_body_camera
+        points = self._map.points_world(self._map.observations_of(last)[0])
+        depth = (points - T[:3, 3]) @ T[:3, 2]
+        return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
 
     def _first_keyframe(self, T_world_body: Array, covariance: Array, points: Array) -> Reference:
         """Make the first view a keyframe, with what is triangulated as landmarks."""

@@ -141,7 +141,7 @@ def two_view_motion(
         return _none(len(first), f"{len(first)} matches of {config.min_points} needed")
     turned = camera.fx * rotation_parallax(first, second)
     if turned < config.min_parallax_px:
-        wait = f"parallax of {turned:.1f} px, {config.min_parallax_px:g} px needed"
+        wait = f"parallax of {turned:.1f} px, {config.min_parallax_px:.1f} px needed"
         return _none(len(first), f"{wait}: move the camera sideways", turned)
     threshold = config.max_error_px / camera.fx
     starts = [
