@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from odomap.version import __version__
 
 if TYPE_CHECKING:
+    from odomap.calibrate import calibrate
     from odomap.errors import (
         CalibrationError,
         ConfigError,
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
         TrackingFailed,
     )
     from odomap.evaluation.metrics import ate, rpe
+    from odomap.export import export
+    from odomap.files.calibrations import read_calibration
+    from odomap.files.clouds import read_ply, write_ply
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
     from odomap.geometry.camera import Camera
@@ -74,12 +78,17 @@ __all__ = [
     "World",
     "__version__",
     "ate",
+    "calibrate",
+    "export",
     "open",
     "preset",
+    "read_calibration",
+    "read_ply",
     "read_rig",
     "read_tum",
     "rpe",
     "run",
+    "write_ply",
     "write_rig",
     "write_tum",
 ]
@@ -111,12 +120,17 @@ _HOMES = {
     "Trajectory": "geometry.trajectory",
     "World": "simulation.world",
     "ate": "evaluation.metrics",
+    "calibrate": "calibrate",
+    "export": "export",
     "open": "sources.open",
     "preset": "system.config",
+    "read_calibration": "files.calibrations",
+    "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
     "rpe": "evaluation.metrics",
     "run": "run",
+    "write_ply": "files.clouds",
     "write_rig": "files.rig",
     "write_tum": "files.trajectories",
 }

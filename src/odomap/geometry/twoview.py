@@ -310,7 +310,9 @@ def homography(first: ArrayLike, second: ArrayLike) -> Array:
     top = np.stack([x, y, one, nil, nil, nil, -u * x, -u * y, -u], axis=-1)
     low = np.stack([nil, nil, nil, x, y, one, -v * x, -v * y, -v], axis=-1)
     rows = np.concatenate([top, low], axis=-2)
-    H = np.linalg.svd(rows)[2][..., -1, :].reshape(*a.shape[:-2], 3, 3)
+    # Four matches leave the null space out of a thin decomposition; more make a full one costly.
+    full = rows.shape[-2] < 9
+    H = np.linalg.svd(rows, full_matrices=full)[2][..., -1, :].reshape(*a.shape[:-2], 3, 3)
     H = np.linalg.inv(T2) @ H @ T1
     return np.asarray(H / np.linalg.norm(H, axis=(-2, -1), keepdims=True))
 

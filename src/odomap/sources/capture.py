@@ -48,12 +48,14 @@ SAME_US = 2
 def quiet() -> Iterator[None]:
     """Keep OpenCV and FFmpeg from printing what the caller says better."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.getLogLevel()
-    cv2.setLogLevel(0)
+    # OpenCV 5 has moved them into a module of their own.
+    log: Any = getattr(cv2.utils, "logging", cv2)
+    level = log.getLogLevel()
+    log.setLogLevel(0)
     try:
         yield
     finally:
-        cv2.setLogLevel(level)
+        log.setLogLevel(level)
 
 
 def open_file(path: Path, *options: int) -> cv2.VideoCapture:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
@@ -130,14 +131,12 @@ class Follower:
         self, view: View, T_world_body: Array, history: Candidates, pixels: Array, expected: Array
     ) -> Followed:
         """Align candidates to their first sights, and triangulate them."""
-        points, parallax, errors, ahead = self._triangulated(T_world_body, history, pixels)
         if self._sights is not None and len(pixels):
-            likely = np.where((ahead & np.isfinite(points[:, 0]))[:, None], points, expected)
             pixels, kept = self._sights.align(
-                *(view, T_world_body, likely, history.keyframes[:, 0], history.first_at, pixels)
+                view, T_world_body, expected, history.keyframes[:, 0], history.first_at, pixels
             )
             history = history.afresh(~kept)
-            points, parallax, errors, ahead = self._triangulated(T_world_body, history, pixels)
+        points, parallax, errors, ahead = self._triangulated(T_world_body, history, pixels)
         enough = parallax >= np.radians(self._config.min_parallax_deg)
         meet = errors * self._camera.fx <= self._config.max_error_px
         # Rays that nearly run parallel may meet anywhere, even behind, and mean nothing yet.
@@ -164,7 +163,7 @@ class Follower:
         if len(Ts) < 2:
             nothing = np.zeros(len(pixels))
             return np.full((len(pixels), 3), np.nan), nothing, nothing, nothing > 0
-        found = triangulate(Ts @ self._T_body_camera, seen_at)
+        found = triangulate(Ts @ self._T_body_camera, seen_at, iterations=3)
         return found.points_world, found.parallax, found.errors, found.ahead
 
     def _expected(self, reference: Reference) -> Array:
@@ -176,8 +175,8 @@ class Follower:
         if not good.size:
             return np.empty((0, 3))
         at = reference.candidates.keypoints
-        apart = np.linalg.norm(at[:, None] - reference.keypoints[None, good], axis=2)
-        near = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+        count = min(NEIGHBOURS, good.size)
+        _, near = cKDTree(reference.keypoints[good]).query(at, np.arange(1, count + 1))
         inverse = np.median(1.0 / depth[good][near], axis=1)
         rays = self._camera.unproject(at)
         return np.asarray(rays / (rays[:, 2] * inverse)[:, None] @ T[:3, :3].T + T[:3, 3])

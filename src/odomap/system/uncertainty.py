@@ -5,20 +5,17 @@ In the world it adds to that of a, as it was when a was the newest,
 
     Σ_k = Ad(T_k_a) Σ_a Ad(T_k_a)ᵀ + f S_k.
 
-Spans of one window each are chained, not neighbouring keyframes: consecutive steps share their
-landmarks and so their errors, which a sum over every step would count again and again. f is the
-variance factor found in the residuals times a factor for errors that observations share.
+Spans of one window each are chained: neighbouring keyframes share their landmarks and so their
+errors. f is the variance factor of the residuals times one for errors that observations share.
 
-Scale. A single camera passes the scale on from window to window, in the landmarks. If the length of
-a step is off by some share, so is all that follows. So errors live in the similarities: Ad and Σ
-are those of Sim(3), and a window without measured depth adds the error of its length |t|,
-ε = uᵀ S_t u / |t|² with u = t / |t|, as a scale that the poses after it inherit.
+Scale. A single camera passes the scale on in the landmarks; where a step is too long, all that
+follows is. So Ad and Σ are those of Sim(3), and a window without measured depth adds the relative
+error of its length, uᵀ S_t u / |t|² with u = t / |t|, as a scale that later poses inherit.
 
-Calibration. No amount of data averages out what the rig says wrongly. An error δ of all inverse
-depths, an offset or a slope across the image, moves the newest keyframe by k_k (the solver's
-response) given a, along the path by g_k = Ad(T_k_a) g_a + k_k; a camera that looks in another
-direction by θ than its mount says moves a pose T by (Ad(T⁻¹) − I) θ. Both stay in the error to the
-end, so they are carried as responses and squared only when asked for (a "consider" covariance):
+Calibration. No data averages out what the rig says wrongly. An error δ of all inverse depths, an
+offset or a slope across the image, moves the newest keyframe by k_k (the solver's response) given
+a, along the path by g_k = Ad(T_k_a) g_a + k_k; a camera turned by θ against its mount moves a pose
+T by (Ad(T⁻¹) − I) θ. Both are carried as responses and squared when asked for ("consider"):
 
     Σ = Σ_k + Σ_δ σ_δ² g_k g_kᵀ + σ_θ² M Mᵀ.
 
