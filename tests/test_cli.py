@@ -111,7 +111,9 @@ def test_help_answers_at_once_and_loads_nothing_heavy():
     assert not modules & {"numpy", "numba", "cv2", "scipy", "matplotlib"}
 
 
-@pytest.mark.parametrize("verb", ["run", "demo", "eval", "info", "config", "doctor"])
+@pytest.mark.parametrize(
+    "verb", ["run", "demo", "calibrate", "eval", "export", "info", "config", "doctor"]
+)
 def test_every_verb_has_help(cli, verb):
     code, out, _ = cli(verb, "--help")
     assert code == 0
@@ -134,7 +136,10 @@ def test_no_words_prints_help_and_fails(cli):
     ("words", "message"),
     [
         (["rnu", "x"], "unknown command 'rnu' (did you mean 'run'?)"),
-        (["frobnicate"], "one of run, demo, eval, info, config, doctor expected"),
+        (
+            ["frobnicate"],
+            "one of run, demo, calibrate, eval, export, info, config, doctor expected",
+        ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),
         (["run", "x", "y"], "unexpected argument 'y'"),
