@@ -17,7 +17,6 @@ from meter import Meter
 from odomap.errors import OdomapError
 from odomap.files.trajectories import write_tum
 from odomap.kernels import modules_with_kernels, warm_up
-from odomap.maps.estimate import Status
 from odomap.run import chosen_config
 from odomap.sources.open import open as open_source
 from odomap.system.odometry import make_odometry
@@ -56,7 +55,7 @@ def play(options: argparse.Namespace) -> None:
         if name in imported or name.startswith("odomap.geometry."):
             warm_up(name)
     meter = Meter()
-    tracked, start, first = 0, 0.0, 0
+    start, first = 0.0, 0
     for count, frame in enumerate(source):
         if count == (options.frames or len(source)):
             break
@@ -65,10 +64,10 @@ def play(options: argparse.Namespace) -> None:
         due = start + 1e-9 * (frame.stamp_ns - first)
         if not options.fast:
             time.sleep(max(0.0, due - time.perf_counter()))
-        estimate = meter.call(system.track, frame)
-        tracked += estimate.status != Status.LOST and estimate.keyframe_id >= 0
-    write_tum(Path(f"{options.prefix}.tum"), system.finish().trajectory)
-    meter.write(f"{options.prefix}.json", tracked, cv2.getNumThreads())
+        meter.call(system.track, frame)
+    trajectory = system.finish().trajectory
+    write_tum(Path(f"{options.prefix}.tum"), trajectory)
+    meter.write(f"{options.prefix}.json", len(trajectory), cv2.getNumThreads())
 
 
 if __name__ == "__main__":

@@ -16,6 +16,8 @@ from typing import NoReturn
 
 from played import Played, play
 
+from odomap.files.rig import read_rig
+
 LAUNCHER = Path(__file__).parent / "peer_launcher.py"
 
 
@@ -66,25 +68,38 @@ def unpacked(vocabulary: str, scratch: Path) -> Path:
 def run(
     options: argparse.Namespace,
     vocabulary: Path,
-    layout: str,
+    played_as: tuple[str, str],
     data: Path,
     prefix: Path,
     frames: int = 0,
     cv_threads: int = 0,
 ) -> Played:
-    """Play a stereo recording to the peer, at the pace of its sensor.
+    """Play a recording to the peer, at the pace of its sensor.
 
     Args:
         options: with those of `add_options`.
         vocabulary: unpacked.
-        layout: "euroc" or "kitti".
+        played_as: its layout ("euroc", "kitti" or "tum") and the mode ("stereo", "mono", "rgbd").
         data: folder of the recording.
         prefix: of the files it writes.
         frames: how many; 0 for all.
         cv_threads: of Python's OpenCV; 0 for the script's choice.
     """
     command = [options.peer_python, str(LAUNCHER), f"{prefix}.json", str(cv_threads)]
-    command += [options.peer_script, layout, str(data), "--mode", "stereo", "--pace"]
+    layout, mode = played_as
+    command += [options.peer_script, layout, str(data), "--mode", mode, "--pace"]
+    command += _calibration(data) if layout == "tum" else []
     command += ["--vocab", str(vocabulary), "--out", str(prefix)]
     command += ["--frames", str(frames)] if frames else []
     return play(command, prefix, f"ORB-SLAM3 on {data.name}")
+
+
+def _calibration(data: Path) -> list[str]:
+    """Return the options that tell the script what a recording of TUM does not say itself."""
+    rig = read_rig(data)
+    assert rig.depth is not None, f"{data}: the rig has no depth"
+    camera = rig.camera(rig.depth.camera).camera
+    lens = ",".join(map(repr, camera.distortion.tolist()))
+    options = ["--K", ",".join(map(repr, camera.intrinsics.tolist()))]
+    options += ["--dist", lens] if lens else []
+    return [*options, "--depth-factor", repr(rig.depth.factor)]

@@ -22,11 +22,21 @@ def main() -> None:
     states: list[str] = []
 
     class Metered(pyorbslam3.Slam):
-        def track_stereo(self, *args: Any, **kwargs: Any) -> Any:
-            result = meter.call(super().track_stereo, *args, **kwargs)
+        pass
+
+    def metered(name: str) -> Any:
+        method = getattr(pyorbslam3.Slam, name)
+
+        def track(self: Any, *args: Any, **kwargs: Any) -> Any:
+            result = meter.call(method, self, *args, **kwargs)
             states.append(str(result.state).rsplit(".", 1)[-1])
             return result
 
+        return track
+
+    for name in ("track_stereo", "track_monocular", "track_rgbd"):
+        if hasattr(pyorbslam3.Slam, name):
+            setattr(Metered, name, metered(name))
     pyorbslam3.Slam = Metered
     set_threads = cv2.setNumThreads
     if int(cv_threads):

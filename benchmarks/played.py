@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from odomap.errors import OdomapError
-from odomap.evaluation.metrics import ate
+from odomap.evaluation.metrics import Alignment, ate
 from odomap.files.trajectories import read_tum
 from odomap.geometry.trajectory import Trajectory
 
@@ -45,11 +45,11 @@ class Played:
         """Return the path of the system."""
         return read_tum(self.path)
 
-    def numbers(self, truth: Trajectory) -> dict[str, float]:
+    def numbers(self, truth: Trajectory, align: Alignment = "se3") -> dict[str, float]:
         """Return what is compared, by name; the error is infinite where there is no path."""
         counted = self.ms[SKIPPED:] or self.ms
         try:
-            error = ate(self.trajectory(), truth).rmse
+            error = ate(self.trajectory(), truth, align).rmse
         except OdomapError as why:
             print(f"no error can be computed: {why}", file=sys.stderr)
             error = float("inf")
@@ -57,6 +57,7 @@ class Played:
             "ate_m": error,
             "frames": self.frames,
             "tracked": self.tracked,
+            "ms_mean": float(np.mean(counted)),
             "ms_median": float(np.median(counted)),
             "ms_p95": float(np.percentile(counted, 95)),
             "cpu_s": self.cpu_s,

@@ -47,7 +47,7 @@ def main() -> int:
         vocabulary = peer.unpacked(options.vocabulary, scratch)
 
         def run_peer(layout: str, data: Path, truth: Trajectory) -> dict[str, float]:
-            played = peer.run(options, vocabulary, layout, data, scratch / "peer")
+            played = peer.run(options, vocabulary, (layout, "stereo"), data, scratch / "peer")
             result = ate(played.trajectory(), truth)
             path = {"percent": result.percent, "path_m": result.path_m}
             return path | played.numbers(truth)
