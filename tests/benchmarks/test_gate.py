@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 NUMBERS = {"ate_m": 0.004, "ms_median": 10.0, "ms_p95": 30.0, "cpu_s": 2.0, "peak_memory_mb": 200.0}
-COUNTS = {"frames": 110, "tracked": 110, "threads": 3, "cv_threads": 2}
+COUNTS = {"ms_mean": 20.0, "frames": 110, "tracked": 110, "threads": 3, "cv_threads": 2}
 
 
 def baseline_of(gate, **changes):
@@ -73,9 +73,9 @@ def sequences(load, monkeypatch, tmp_path):
     """Return the module with runs that are made up, and a baseline of its own."""
     module = load("sequences")
     monkeypatch.setattr(module, "BASELINE", tmp_path / "baseline.json")
-    for name in module.RECORDINGS:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "groundtruth.txt").touch()
+    for recording in module.RECORDINGS.values():
+        (tmp_path / recording.folder).mkdir(exist_ok=True)
+        (tmp_path / recording.folder / recording.truth).touch()
     (tmp_path / "vocabulary.txt").touch()
     ours, peer = NUMBERS | COUNTS, {name: 2.0 * v for name, v in NUMBERS.items()} | COUNTS
     monkeypatch.setattr(module, "compare", lambda *_: {"ours": [dict(ours)], "peer": [dict(peer)]})
@@ -84,6 +84,7 @@ def sequences(load, monkeypatch, tmp_path):
         "--peer-python": sys.executable,
         "--peer-script": __file__,
         "--vocabulary": tmp_path / "vocabulary.txt",
+        "--recordings": "euroc_mh01",
     }
     given = [str(part) for pair in made_up.items() for part in pair]
 
@@ -109,7 +110,8 @@ def test_gate_of_sequences(sequences, capsys):
     ("changes", "said"),
     [
         ({"ate_m": 0.0056}, "euroc_mh01: ATE 0.0056 m"),
-        ({"tracked": 109}, "euroc_mh01: 1 frames lost"),
+        ({"tracked": 109}, "euroc_mh01: 109 frames have a pose, 110 needed"),
+        ({"ms_mean": 40.0}, "euroc_mh01: 25 frames per second, 30 needed"),
         ({"ms_p95": 43.0}, "p95: 0.72 of the peer's"),
     ],
 )
