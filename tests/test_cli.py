@@ -280,6 +280,27 @@ def test_run_writes_everything_and_says_where(cli, recording, tmp_path):
         assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
 
 
+def test_run_of_a_single_camera_says_that_its_scale_is_its_own(cli, tmp_path):
+    world = "sim:room?seed=3&frames=20&rate_hz=12&resolution=400x250&sensors=mono"
+    code, out, err = cli("run", world, "--out", "a")
+    assert code == 0, err
+    assert "ATE RMSE" in out
+    assert "one camera cannot tell the scale" in out + err
+    m = metrics(tmp_path / "a")
+    assert m["is_metric"] is False
+    assert len(read_tum(tmp_path / "a" / "keyframes.tum")) == m["keyframes"]
+    config = (tmp_path / "a" / "config.yaml").read_text()
+    assert "sensors: mono" in config
+    code, _, err = cli("run", world, "--config", "a/config.yaml", "--out", "b")
+    assert code == 0, err
+    for name in ("trajectory.tum", "keyframes.tum"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
+    # A pair is asked for: there is none.
+    code, _, err = cli("run", world, "--preset", "stereo")
+    assert code == 2
+    assert "stereo needs two cameras" in err
+
+
 def test_run_without_out_writes_below_runs(cli, recording, tmp_path):
     code, _, _ = cli("run", recording, "--max-frames", "3")
     assert code == 0

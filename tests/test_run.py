@@ -239,3 +239,89 @@ def test_spread_and_memory():
     assert spread([1.0, 2.0, 9.0])["median"] == 2.0
     assert spread([])["p95"] == 0.0
     assert 20 < peak_memory_mb() < 1e5
+
+
+# ---- every camera ----
+
+LONE = "sim:room?seed=3&frames=24&rate_hz=12&resolution=400x250&sensors="
+
+
+@pytest.fixture(scope="module")
+def lone(tmp_path_factory):
+    """A run of a single camera, and the recording."""
+    from odomap.sources.disturb import drop
+
+    source = drop(open_source(LONE + "mono"), [])
+    return run(source, tmp_path_factory.mktemp("lone")), source
+
+
+def test_a_single_camera_is_tracked_as_one(lone):
+    result, source = lone
+    assert result.failure == ""
+    assert "sensors: mono" in (result.out / "config.yaml").read_text()
+    m = result.metrics
+    assert m["is_metric"] is False
+    assert m["statuses"]["initializing"] > 0
+    # Frames before the start are placed in the end.
+    assert m["frames"] == m["tracked"] == len(result.trajectory) == 24
+    assert len(result.trajectory_live) == 24 - m["statuses"]["initializing"]
+    assert "one camera cannot tell the scale: lengths are in units of their own" in result.warnings
+    assert not any("lost" in warning or "anew" in warning for warning in result.warnings)
+    # So truth is compared up to scale.
+    assert m["ate"]["scale"] == pytest.approx(
+        odomap.ate(result.trajectory, source.truth, "sim3").scale
+    )
+    assert m["ate"]["scale"] > 1.5
+    assert m["ate_rmse_m"] < 0.01
+
+
+def test_keyframes_have_a_file_of_their_own(lone, result):
+    for found in (lone[0], result):
+        keyframes = read_tum(found.out / "keyframes.tum")
+        assert len(keyframes) == found.metrics["keyframes"] >= 2
+        path = read_tum(found.out / "trajectory.tum")
+        rows = np.searchsorted(path.stamps_ns, keyframes.stamps_ns)
+        np.testing.assert_array_equal(path.stamps_ns[rows], keyframes.stamps_ns)
+        np.testing.assert_allclose(path.positions[rows], keyframes.positions, atol=1e-9)
+
+
+def test_the_config_of_a_single_camera_repeats_its_run(lone, tmp_path):
+    result, source = lone
+    again = run(source, tmp_path, config=result.out / "config.yaml")
+    for name in ("trajectory.tum", "trajectory_live.tum", "keyframes.tum"):
+        assert (again.out / name).read_bytes() == (result.out / name).read_bytes()
+
+
+def test_a_camera_with_depth_is_tracked_with_it(tmp_path):
+    result = run(LONE + "mono,depth", tmp_path, max_frames=12)
+    assert "sensors: rgbd" in (tmp_path / "config.yaml").read_text()
+    m = result.metrics
+    assert m["is_metric"] is True
+    assert (m["frames"], m["tracked"], m["lost"]) == (12, 12, 0)
+    assert m["statuses"]["initializing"] == 0
+    assert m["ate"]["scale"] == 1.0
+    assert m["ate_rmse_m"] < 0.01
+    assert not any("scale" in warning for warning in result.warnings)
+
+
+def test_one_camera_of_a_pair_may_be_asked_for():
+    """The path is that of the camera, though the body is the IMU."""
+    world = "sim:room?seed=3&frames=20&rate_hz=12&resolution=400x250&sensors=stereo,imu"
+    source = open_source(world)
+    result = run(source, preset="mono")
+    assert result.metrics["is_metric"] is False
+    assert result.failure == ""
+    assert result.metrics["tracked"] == 20
+    mount = source.rig.cameras[0].T_body_camera.matrix
+    assert np.abs(mount - np.eye(4)).max() > 0.01
+    assert result.metrics["ate_rmse_m"] < 0.01
+
+
+def test_a_camera_that_never_moves_fails_with_the_reason():
+    source = open_source(LONE + "mono")
+    still = source.frame(0)
+    edited = Edited(source, lambda frame: Frame(frame.id, frame.stamp_ns, still.images))
+    result = run(edited, max_frames=6)
+    assert "0 of 6 frames have a pose" in result.failure
+    assert "move the camera sideways" in result.failure
+    assert result.metrics["keyframes"] == 0
