@@ -185,6 +185,30 @@ def test_any_pose_may_be_the_one_held():
     assert u @ solution.joint_covariance @ u < 1e-3 * top
 
 
+def test_two_poses_held_at_one_place_hold_no_size_either():
+    """A camera that stood: of the size they say nothing, and it is held all the same."""
+    scene = camera_scene(seed=3)
+    Ts = scene.Ts_world_body.copy()
+    Ts[1] = Ts[0]
+    local = (scene.points_world - Ts[0, :3, 3]) @ Ts[0, :3, :3]
+    xy = scene.xy.copy()
+    second = scene.pose == 1
+    xy[second] = (local[:, :2] / local[:, 2:])[scene.point[second]]
+    scene = replace(scene, Ts_world_body=Ts, xy=xy)
+    bundle = free(scene, 3, fixed=2)
+    solution = solve_bundle(bundle, THOROUGH)
+    assert solution.reason == "converged" or solution.reason == "no step lowers the cost"
+    assert size(solution.Ts_world_body) == pytest.approx(size(bundle.Ts_world_body), rel=5e-3)
+    joint = solution.joint_covariance
+    assert np.isfinite(joint).all()
+    assert (np.linalg.eigvalsh(joint) > 0).all()
+    u = np.concatenate(
+        [[*(T[:3, :3].T @ (T[:3, 3] - Ts[0, :3, 3])), 0, 0, 0] for T in solution.Ts_world_body[2:]]
+    )
+    u /= np.linalg.norm(u)
+    assert u @ joint @ u < 1e-3 * np.linalg.eigvalsh(joint)[-1]
+
+
 def test_all_poses_at_one_place_have_no_size():
     """A pure turn: nothing to hold, and the solver says so rather than dividing by zero."""
     scene = camera_scene(seed=1)

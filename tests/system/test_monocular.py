@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odomap.errors import CalibrationError
+from odomap.errors import CalibrationError, ConfigError
 from odomap.evaluation.metrics import ate
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
@@ -306,6 +306,28 @@ def test_a_camera_at_rest_waits_and_starts_when_it_moves(wall):
     assert ate(result.trajectory, recording.truth, "sim3").rmse < 0.005
 
 
+def test_a_camera_that_rests_for_longer_than_the_window_keeps_its_scale(wall):
+    """All keyframes of the window, those that hold it too, are at one place for a while."""
+    there = walk(14)
+    onwards = there[-1] @ walk(14)
+    recording = wall.recording(np.concatenate([there, np.tile(there[-1:], (26, 1, 1)), onwards]))
+    config = preset("mono")
+    config = replace(config, tracking=replace(config.tracking, keyframe_interval=2))
+    estimates, result, _ = run(recording, config)
+    assert Status.LOST not in {e.status for e in estimates}
+    resting = [e for e in estimates if 16 <= e.frame_id < 40]
+    assert sum(e.is_keyframe for e in resting) > 9
+    ours = result.trajectory
+    first, second = (
+        ate(share(ours, rows), recording.truth, "sim3").scale
+        for rows in (slice(0, 14), slice(40, None))
+    )
+    assert second == pytest.approx(first, rel=0.02)
+    assert np.ptp(ours.positions[15:40], axis=0).max() < 0.004
+    assert np.isfinite(ours.covariances).all()
+    assert (np.linalg.eigvalsh(ours.covariances[1:]) > 0).all()
+
+
 def test_images_without_texture_wait(depth_room):
     flat = np.full((250, 400), 80, np.uint8)
     frames = [replace(f, images=(flat,)) for f in depth_room.part(0, 5)]
@@ -363,6 +385,13 @@ def test_the_mount_of_a_camera_is_told_and_truth_is_that_of_the_camera(depth_roo
         covariances=None,
     )
     assert ate(result.trajectory, result.truth(body), "sim3").rmse < 0.01
+
+
+def test_a_configuration_without_candidates_is_none_for_a_single_camera(depth_room):
+    config = preset("mono")
+    config = replace(config, candidates=replace(config.candidates, follow=False))
+    with pytest.raises(ConfigError, match=r"candidates\.follow"):
+        MonocularVO(depth_room.rig.cameras[0].camera, config)
 
 
 def test_a_rig_without_a_camera():

@@ -148,7 +148,7 @@ def test_depth_full_of_holes_waits(depth_room):
     estimates, _, _ = run(edited(depth_room, holes, 0, 6))
     for e in estimates[:2]:
         assert e.status is Status.INITIALIZING
-        assert e.reason == "0 points with depth of 30 needed to start: too dark or no texture?"
+        assert e.reason.startswith("0 points with depth of 30 needed to start: ")
     assert estimates[2].status is Status.TRACKING
 
 
