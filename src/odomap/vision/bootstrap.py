@@ -11,7 +11,7 @@ is nothing to triangulate, and a plane allows two motions that explain both view
    the right motion are seen where they should be from there as well. If they cannot tell, one
    waits.
 
-Cost: about 20 ms for 500 matches; the test for parallax, 0.1 ms, comes first.
+Cost: 0.1 to 0.2 s for 500 matches; the test for parallax, which is cheap, comes first.
 
 Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section IV; Nistér, T-PAMI 2004.
 """
