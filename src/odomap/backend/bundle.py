@@ -67,8 +67,9 @@ class Bundle:
         xy: (N, 2) measured normalised image coordinates.
         disparity: (N,) measured disparity over focal length, NaN where there is none.
         weights: (N, 2) inverse standard deviations of xy and of the disparity.
-        is_scale_free: nothing measures how large the scene is: a single camera with one pose held.
-            The size of the path is then held too, that of the poses as they come.
+        is_scale_free: nothing measures how large the scene is: a single camera whose poses held
+            are one, or at one place. The size of the path is then held too, that of the poses as
+            they come.
     """
 
     Ts_world_body: Array

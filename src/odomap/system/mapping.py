@@ -10,6 +10,7 @@ How sure the newest keyframe's pose is in the world then follows from the soluti
 Reference: Mouragnon et al., "Real Time Localization and 3D Reconstruction", CVPR 2006.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,7 @@ class WindowMapper:
         together = [k for k in tied if not self._recent or k > self._recent[-1]]
         self._recent = [*kept, *together, keyframe.id]
         if len(self._recent) < 2:
-            self._map.retire_keyframes(leaving)
+            self._retire(leaving)
             return None
         held = max(1, len(self._recent) - size)
         snapshot = self._map.snapshot(self._recent[held:], self._recent[:held])
@@ -108,9 +109,13 @@ class WindowMapper:
                 self._drifts[newest] = change.drift
                 covariance = self._calibration.total(change.drift, map.T_world_body(newest))
                 map.set_covariance([newest], covariance)
-            map.retire_keyframes(change.leaving)
-            for keyframe_id in change.leaving:
-                self._drifts.pop(keyframe_id, None)
+            self._retire(change.leaving)
+
+    def _retire(self, leaving: Sequence[int]) -> None:
+        """Forget what keyframes saw, and their drift: no later one hangs from them."""
+        self._map.retire_keyframes(leaving)
+        for keyframe_id in leaving:
+            self._drifts.pop(keyframe_id, None)
 
     def _drift(self, keyframe_id: int) -> Drift:
         """Return a keyframe's drift; where odometry began, what the tracker said of it."""
@@ -142,10 +147,26 @@ class WindowMapper:
             xy,
             inverse_depth,
             np.tile(self._weights, (len(xy), 1)),
-            is_scale_free=bool(
-                snapshot.is_fixed.sum() == 1 and not np.isfinite(inverse_depth).any()
-            ),
+            is_scale_free=not np.isfinite(inverse_depth).any()
+            and _at_one_place(snapshot, 1.0 / float(self._weights[0])),
         )
+
+
+def _at_one_place(snapshot: Snapshot, sigma: float) -> bool:
+    """Say whether the fixed keyframes are too near to each other to tell how large a scene is.
+
+    One alone is, and so are two of a camera that stood still: their parallax is lost in the
+    noise of a point, `sigma` in normalised image coordinates.
+    """
+    fixed = snapshot.Ts_world_body[snapshot.is_fixed][:, :3, 3]
+    depth = _median_distance(snapshot.points_world, fixed[-1])
+    return bool(np.linalg.norm(fixed - fixed[-1], axis=1).max() < sigma * depth)
+
+
+def _median_distance(points_world: Array, from_world: Array) -> float:
+    """Return how far points (N, 3) typically are from another; 1 if there are none."""
+    away = np.linalg.norm(points_world - from_world, axis=1)
+    return float(np.median(away)) if len(away) else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +202,9 @@ class WindowJob:
         anchor = int(np.flatnonzero(self.snapshot.is_fixed)[-1])
         Ts = solution.Ts_world_body
         T_newest_anchor = se3_inverse(Ts[newest]) @ Ts[anchor]
-        scale_drifts = not (self.bundle.is_scale_free or np.isfinite(self.bundle.disparity).any())
-        drift = self.anchor_drift.onwards(
-            T_newest_anchor, solution, newest, self.overlap, scale_drifts
-        )
+        measured = self.bundle.is_scale_free or np.isfinite(self.bundle.disparity).any()
+        depth = None if measured else _median_distance(solution.points_world, Ts[newest, :3, 3])
+        drift = self.anchor_drift.onwards(T_newest_anchor, solution, newest, self.overlap, depth)
         newest_id = int(self.snapshot.keyframe_ids[newest])
         return WindowChange(self.mapper, update, newest_id, drift, self.leaving, solution)
 

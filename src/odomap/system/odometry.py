@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import CalibrationError
+from odomap.errors import CalibrationError, ConfigError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
@@ -158,7 +158,7 @@ class MonocularVO(Odometry):
         T_body_camera: its mount on a rig, which a result tells; poses are the camera's anyway.
 
     Raises:
-        ConfigError: if there is no such rhythm.
+        ConfigError: if there is no such rhythm, or the configuration does not follow candidates.
     """
 
     def __init__(
@@ -169,6 +169,11 @@ class MonocularVO(Odometry):
         T_body_camera: SE3 | None = None,
     ) -> None:
         config = preset("mono") if config is None else config
+        if not config.candidates.follow:
+            raise ConfigError(
+                "candidates.follow: false, but a single camera gets its landmarks that way alone: "
+                "set it true, or take the preset mono"
+            )
         super().__init__(Eye.of_camera(camera), None, config, rhythm)
         if T_body_camera is not None:
             self._T_body_tracked = np.array(T_body_camera.matrix)

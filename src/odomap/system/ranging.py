@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import CalibrationError, InputError
+from odomap.errors import CalibrationError
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 from odomap.system.association import View
@@ -178,13 +178,13 @@ class DepthRanger:
         """Look the points up.
 
         Raises:
-            InputError: the depth image has another size than the camera's.
+            CalibrationError: the depth image has another size than the camera's.
         """
         depth = frame.depth
         assert depth is not None, "missing() says so first"
         if depth.shape[::-1] != self.eye.raw:
             (w, h), (width, height) = depth.shape[::-1], self.eye.raw
-            raise InputError(
+            raise CalibrationError(
                 f"frame {frame.id}: the depth image is {w}x{h}, the camera's {width}x{height}: "
                 "depth must be registered to the camera"
             )

@@ -95,6 +95,7 @@ class OneViewStart:
 
     def __init__(self, keyframes: Keyframes, association: Association, config: Config) -> None:
         self._keyframes, self._association, self._config = keyframes, association, config
+        self._is_checked = False
 
     def begin(
         self, frame: Frame, view: View, T_world_body: Array, covariance: Array
@@ -104,14 +105,19 @@ class OneViewStart:
         if missing:
             return Waiting(f"{missing}: cannot start")
         assert self._keyframes.ranger is not None, "one view needs measured depth"
-        points, _ = self._association.extend(view, np.empty((0, 2)), 200)
-        self._keyframes.ranger.check(frame, view, points)
+        if not self._is_checked:  # a rig that was right once is not to blame for a strange view
+            points, _ = self._association.extend(view, np.empty((0, 2)), 200)
+            self._keyframes.ranger.check(frame, view, points)
         seen = self._keyframes.begin(frame, view)
         count = int(np.isfinite(seen.features.depth).sum())
         needed = 2 * self._config.tracking.min_inliers
         if count < needed:
-            why = f"{count} points with depth of {needed} needed to start"
-            return Waiting(f"{why}: too dark or no texture?")
+            corners, _ = self._association.extend(view, np.empty((0, 2)), needed)
+            why = "too dark or no texture?"
+            if len(corners) >= needed:
+                why = "there are corners, but their depth is unknown: too near, too far?"
+            return Waiting(f"{count} points with depth of {needed} needed to start: {why}")
+        self._is_checked = True
         made = self._keyframes.add(view, T_world_body, seen, -1, covariance)
         placed = Placed(frame.stamp_ns, made.keyframe_id, np.eye(4), np.zeros((6, 6)))
         return Started(made, (placed,), count)

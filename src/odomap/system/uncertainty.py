@@ -10,7 +10,8 @@ errors. f is the variance factor of the residuals times one for errors that obse
 
 Scale. A single camera passes the scale on in the landmarks; where a step is too long, all that
 follows is. So Ad and Σ are those of Sim(3), and a window without measured depth adds the relative
-error of its length, uᵀ S_t u / |t|² with u = t / |t|, as a scale that later poses inherit.
+error of its length, uᵀ S_t u / |t|² with u = t / |t|, as a scale that later poses inherit. One
+too short for new landmarks adds less: those there are keep the scale of a camera that stands.
 
 Calibration. No data averages out what the rig says wrongly. An error δ of all inverse depths, an
 offset or a slope across the image, moves the newest keyframe by k_k (the solver's response) given
@@ -35,6 +36,9 @@ from odomap.geometry.lie import se3_adjoint, se3_inverse, sim3_adjoint
 __all__ = ["Calibration", "Drift", "NoiseConfig"]
 
 Array = NDArray[np.float64]
+
+LEAST_PARALLAX = 0.02
+"""Radians; a camera that moves by less of the depth makes no landmarks that carry the scale on."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class Drift:
         solution: BundleSolution,
         newest: int,
         overlap: float,
-        scale_drifts: bool,
+        depth: float | None,
     ) -> "Drift":
         """Return the drift of a window's newest keyframe, this being that of its anchor.
 
@@ -83,13 +87,13 @@ class Drift:
             solution: of the window.
             newest: its row in the solution.
             overlap: factor for errors that observations share.
-            scale_drifts: whether nothing in the window measures its size.
+            depth: of the landmarks, where nothing in the window measures its size; else None.
         """
         Ad = sim3_adjoint(T_newest_anchor)
         to_tangent = np.eye(7, 6)
         t = T_newest_anchor[:3, 3]  # the anchor as the newest keyframe sees it
-        if scale_drifts and t @ t > 0:
-            to_tangent[6, :3] = -t / (t @ t)
+        if depth is not None:
+            to_tangent[6, :3] = -t / max(float(t @ t), (LEAST_PARALLAX * depth) ** 2)
         S = overlap * solution.variance_factor * solution.covariances[newest]
         return Drift(
             Ad @ self.covariance @ Ad.T + to_tangent @ S @ to_tangent.T,
