@@ -93,17 +93,26 @@ class Logbook:
         wide = np.nonzero(steps > max(GAP_S, 3.0 * float(np.median(steps))))[0]
         return [(self.estimates[k].frame_id, float(steps[k])) for k in wide]
 
-    def failure(self) -> str:
-        """Return why the run has no usable path; empty when it has one."""
+    def failure(self, placed: int | None = None) -> str:
+        """Return why the run has no usable path; empty when it has one.
+
+        Args:
+            placed: how many frames have a pose in the end; default those that had one at once.
+        """
         total = len(self.estimates)
-        placed = self.placed
+        placed = self.placed if placed is None else placed
         if total == 0:
             return "no frame could be read"
         if placed >= max(2, total / 2):
             return ""
-        reasons = Counter(e.reason for e in self.estimates if e.status == Status.LOST and e.reason)
+        if placed == total:
+            return "one frame is no path"
+        lost = self.count(Status.LOST) > 0
+        waited = Status.LOST if lost else Status.INITIALIZING
+        reasons = Counter(e.reason for e in self.estimates if e.status == waited and e.reason)
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
-        return f"tracking was lost, {placed} of {total} frames have a pose{why}"
+        what = "was lost" if lost else "started late" if placed else "never started"
+        return f"tracking {what}, {placed} of {total} frames have a pose{why}"
 
     def numbers(self) -> dict[str, Any]:
         """Return the part of metrics.json that the frames tell."""

@@ -254,7 +254,7 @@ def _track(
 
 def _expected(source: "Source", max_frames: int | None) -> int:
     """Return how many frames there are to track; 0 where nobody knows, as with a live camera."""
-    return min(n for n in (len(source) or max_frames or 0, max_frames or len(source)))
+    return min((n for n in (len(source), max_frames) if n), default=0)
 
 
 def _concluded(
@@ -293,13 +293,15 @@ def _metrics(
     warnings = list(getattr(source, "notes", []))
     metrics: dict[str, Any] = {"name": source.name} | logbook.numbers() | skipped_numbers(source)
     # Frames that were placed later have a pose now.
-    metrics["tracked"] = len(result.trajectory)
+    placed = set(result.trajectory.stamps_ns.tolist())
+    lost = [e for e in logbook.estimates if e.status == Status.LOST and e.stamp_ns not in placed]
+    metrics["tracked"], metrics["lost"] = len(placed), len(lost)
     metrics["is_metric"] = result.is_metric
     metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
     metrics["keyframes"] = len(result.keyframes)
     metrics["landmarks"] = result.map.num_landmarks
     metrics["loops"] = 0
-    metrics["failure"] = logbook.failure()
+    metrics["failure"] = logbook.failure(len(placed))
     metrics["ate_rmse_m"] = None
     metrics["ate"] = None
     if source.truth is not None:
@@ -323,9 +325,8 @@ def _metrics(
         warnings.append(f"skipped {what}: {first.file}: {first.reason}")
     for frame_id, seconds in logbook.gaps():
         warnings.append(f"a gap of {seconds:.2f} s after frame {frame_id}")
-    if metrics["lost"] and not metrics["failure"]:
-        reason = next(e.reason for e in logbook.estimates if e.status.value == "lost")
-        warnings.append(f"{metrics['lost']} of {metrics['frames']} frames lost: {reason}")
+    if lost and not metrics["failure"]:
+        warnings.append(f"{len(lost)} of {metrics['frames']} frames lost: {lost[0].reason}")
     metrics["warnings"] = warnings
     metrics["versions"] = versions()
     return metrics, warnings
