@@ -262,16 +262,17 @@ class Keyframes:
         full = keyframes[:, -1] >= 0
         full[placed] = False
         keyframes[full], rows[full], first_at[full] = -1, -1, keypoints[full]
-        room = np.flatnonzero(keyframes[:, -1] < 0)
-        at = np.argmax(keyframes[room] < 0, axis=1)
-        keyframes[room, at], rows[room, at] = keyframe_id, n + room
+        # This keyframe goes into the first free column of each that has one.
+        unfilled = np.flatnonzero(keyframes[:, -1] < 0)
+        column = np.argmax(keyframes[unfilled] < 0, axis=1)
+        keyframes[unfilled, column], rows[unfilled, column] = keyframe_id, n + unfilled
         return Candidates(keypoints, seen.features.descriptors[n:], first_at, keyframes, rows)
 
     def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:
         """Tell the map which earlier keyframes have seen new landmarks."""
         for keyframe_id in np.unique(history.keyframes[history.keyframes >= 0]).tolist():
             if self._map.keyframe(keyframe_id).features is None:
-                continue
+                continue  # it has left the window, and what it saw is forgotten
             which, view = np.nonzero(history.keyframes == keyframe_id)
             self._map.add_observations(keyframe_id, landmark_ids[which], history.rows[which, view])
 

@@ -77,13 +77,13 @@ class WindowMapper:
         """Take in a keyframe that is in the map, and read the window that it ends."""
         size, fixed = self._window.size, self._window.fixed
         tied = np.sort(self._map.covisible(keyframe.id)[0]).tolist()
-        # Odometry that starts anew has no tie to the window, and may make two keyframes at once.
-        leaving = (
-            self._recent[: -(size + fixed - 1)] if set(tied) & set(self._recent) else self._recent
-        )
+        # Odometry that starts anew shares no landmark with the window: all of that leaves.
+        starts_anew = set(tied).isdisjoint(self._recent)
+        leaving = self._recent if starts_anew else self._recent[: -(size + fixed - 1)]
         kept = self._recent[len(leaving) :]
-        together = [k for k in tied if not self._recent or k > self._recent[-1]]
-        self._recent = [*kept, *together, keyframe.id]
+        # A single camera starts with two keyframes at once, and only the second comes by here.
+        partner = [k for k in tied if not self._recent or k > self._recent[-1]]
+        self._recent = [*kept, *partner, keyframe.id]
         if len(self._recent) < 2:
             self._retire(leaving)
             return None

@@ -95,8 +95,10 @@ class Path:
         return _trajectory([(f.stamp_ns, self._pose(f), self.covariance(f)) for f in self._frames])
 
     def keyframes(self) -> Trajectory:
-        """Return the keyframes among the frames, as known now."""
-        keyframes = [f for f in self._frames if np.array_equal(f.T_keyframe_body, np.eye(4))]
+        """Return the keyframes among the frames, those that hang from themselves, as known now."""
+        keyframes = [
+            f for f in self._frames if self._map.keyframe(f.keyframe_id).stamp_ns == f.stamp_ns
+        ]
         rows = [(f.stamp_ns, self._pose(f), self.covariance(f)) for f in keyframes]
         return _trajectory(rows)
 

@@ -155,8 +155,10 @@ class TwoViewsStart:
         self._association, self._config = association, config
         self._first: View | None = None
         self._last: View | None = None
+        # Of all corners of the first view: where, and how they look.
         self._corners, self._descriptors = np.empty((0, 2)), np.empty((0, 0), np.uint8)
-        self._pixels, self._alive = np.empty((0, 2)), np.empty(0, np.int64)
+        # Of those followed until the last view: which corners, where now, and the last step.
+        self._alive, self._pixels = np.empty(0, np.int64), np.empty((0, 2))
         self._flow = np.empty((0, 2))
         self._between: list[_Between] = []
         self._needed_px = config.bootstrap.min_parallax_px
