@@ -237,18 +237,20 @@ def _track(
 ) -> "Result":
     """Track frame after frame until the source, the limit or the user ends it."""
     total, frames = _expected(source, max_frames), iter(source)
-    for frame in frames:
-        start = time.perf_counter()
-        estimate = system.worker.advance(frame)
-        logbook.add(frame, estimate, time.perf_counter() - start)
-        if outputs is not None:
-            outputs.append(estimate)
-        done = len(logbook.estimates)
-        tell(Progress("tracking", done, total, estimate, logbook.frames_per_second))
-        if interrupt.is_set() or done == max_frames:
-            break
-    if isinstance(frames, Generator):
-        frames.close()  # a camera is let go, and says what there is to say of it
+    try:
+        for frame in frames:
+            start = time.perf_counter()
+            estimate = system.worker.advance(frame)
+            logbook.add(frame, estimate, time.perf_counter() - start)
+            if outputs is not None:
+                outputs.append(estimate)
+            done = len(logbook.estimates)
+            tell(Progress("tracking", done, total, estimate, logbook.frames_per_second))
+            if interrupt.is_set() or done == max_frames:
+                break
+    finally:
+        if isinstance(frames, Generator):
+            frames.close()  # a camera is let go, and says what there is to say of it
     return system.finish()
 
 

@@ -157,3 +157,25 @@ def test_a_failure_says_what_happened(statuses, placed, why):
     for k, status in enumerate(statuses):
         book.add(Frame(k, k), Estimate(k, k, status, "still", -1, at, at, np.eye(6)), 0.01)
     assert book.failure(placed) == why
+
+
+def test_a_source_is_let_go_when_tracking_fails(depth_room):
+    source = OneEye(depth_room, list(depth_room)[:4])
+    wrong, let_go = source._frames[2], []
+    source._frames[2] = replace(wrong, images=(wrong.images[0][::2, ::2].copy(),))
+
+    class Camera(OneEye):
+        def __init__(self):
+            self.__dict__ |= source.__dict__
+
+        def __iter__(self):
+            try:
+                yield from source
+            finally:
+                let_go.append(True)
+
+    camera = Camera()
+    with pytest.raises(CalibrationError, match="frame 2: the image is 200x125") as raised:
+        run(camera)
+    assert raised.value.__traceback__ is not None  # which keeps what was on the way alive
+    assert let_go == [True]
