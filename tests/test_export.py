@@ -78,6 +78,14 @@ def test_a_mesh_of_a_room_is_within_2_cm_of_the_truth(exported):
     assert result.config.voxel == 0.02
 
 
+def test_a_path_without_scale_is_refused(tmp_path):
+    folder = a_run(tmp_path / "run", PAIR)  # there is depth, but the run used one camera of two
+    (folder / "metrics.json").write_text('{"is_metric": false}', encoding="utf-8")
+    with pytest.raises(InputError, match=r"run: the run is of one camera.*no scale.*--preset mono"):
+        export(folder)
+    assert not (folder / "mesh.ply").exists()
+
+
 def test_the_mesh_covers_what_was_seen(exported):
     from scipy.spatial import cKDTree
 

@@ -17,6 +17,7 @@ Reference: B. Curless, M. Levoy, "A volumetric method for building complex model
 images", SIGGRAPH 1996.
 """
 
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -108,8 +109,8 @@ def export(
         The surface and where it was written.
 
     Raises:
-        InputError: no run, no depth, a recording that is not there or another one, values that
-            cannot be.
+        InputError: no run, no depth, a path without scale, a recording that is not there or
+            another one, values that cannot be.
         OutputError: a file cannot be written.
 
     Example:
@@ -125,6 +126,7 @@ def export(
     folder = Path(run)
     files = _files(folder, cloud, mesh)
     poses, notes = _poses(folder)
+    _need_metres(folder)
     source = _source(folder, data, rig)
     try:
         views = depth_views(source.rig)
@@ -183,6 +185,19 @@ def _poses(folder: Path) -> tuple[Trajectory, list[str]]:
             chosen.append(row)
     note = f"there is no keyframes.tum: {len(chosen)} poses of trajectory.tum are used"
     return path.rows(chosen), [note]
+
+
+def _need_metres(folder: Path) -> None:
+    """Raise an InputError if the run's path has no scale: metres of depth do not fit to it."""
+    try:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return  # a path from elsewhere, of which nothing is said, is taken to be metric
+    if isinstance(metrics, dict) and metrics.get("is_metric") is False:
+        raise InputError(
+            f"{folder}: the run is of one camera, so its path has no scale that depth would fit "
+            "to: run it again with depth or a stereo pair (without --preset mono)"
+        )
 
 
 def _source(folder: Path, data: str | Path | None, rig: "Rig | str | Path | None") -> "Source":
