@@ -107,7 +107,7 @@ class Outputs:
         """
         self._close_live()
         failures: list[OutputError] = []
-        report = self._report(source, result, logbook, metrics)
+        report = self._report(source, result, logbook, metrics, warnings)
         jobs: list[tuple[str, Callable[[], object]]] = [
             ("trajectory.tum", lambda: write_tum(self._at("trajectory.tum"), result.trajectory)),
             (
@@ -135,16 +135,25 @@ class Outputs:
         return self.folder / name
 
     def _report(
-        self, source: "Source", result: "Result", logbook: Logbook, metrics: dict[str, Any]
+        self,
+        source: "Source",
+        result: "Result",
+        logbook: Logbook,
+        metrics: dict[str, Any],
+        warnings: list[str],
     ) -> "Report":
         """Gather what the report shows."""
         import numpy as np
 
         from odomap.geometry.pose import Sim3
-        from odomap.views.record import Report, Sample
+        from odomap.views.record import Report, Sample, Scale
 
         # A path without a scale is drawn at that of the truth, where there is one.
         scale = metrics["ate"]["scale"] if metrics["ate"] and not result.is_metric else 1.0
+        fitted: Scale = "fitted" if metrics["ate"] else "free"
+        numbers = {name: metrics[name] for name in REPORTED}
+        if not result.is_metric:
+            numbers["path_units"] = numbers.pop("path_m")
         shown = Sim3.from_parts(scale, np.eye(3), np.zeros(3))
         return Report(
             title=source.name,
@@ -157,12 +166,14 @@ class Outputs:
             trajectory=result.trajectory.transformed(shown),
             truth=None if source.truth is None else result.truth(source.truth),
             scores={"ATE": metrics["ate"]} if metrics["ate"] else {},
-            metrics={name: metrics[name] for name in REPORTED},
+            metrics=numbers,
             samples=[
                 Sample(frame.images[0], estimate)
                 for frame, estimate in logbook.samples
                 if frame.images and frame.images[0] is not None
             ],
+            warnings=warnings,
+            scale="metric" if result.is_metric else fitted,
             skipped=[(item.stamp_ns, item.file, item.reason) for item in source.skipped],
             points=scale * result.map.points_world(result.map.landmark_ids),
         )

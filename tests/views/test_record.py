@@ -42,9 +42,22 @@ def test_without_truth_accuracy_is_unknown(report_of: Make) -> None:
 def test_start_up_frames_are_neither_tracked_nor_lost(report_of: Make) -> None:
     run = report_of(10)
     first = replace(run.estimates[0], status=Status.INITIALIZING)
-    says = verdict(replace(run, estimates=[first, *run.estimates[1:]]))
+    starting = replace(run, estimates=[first, *run.estimates[1:]])
+    assert run.trajectory is not None
+    without = replace(starting, trajectory=run.trajectory.rows(range(1, 10)))
+    says = verdict(without)
     assert says.text.startswith("Tracked 9 of 10 frames (1 for start-up)")
     assert says.level == "good"
+    # A start's first views are placed afterwards, and then count as the metrics count them.
+    assert verdict(starting).text.startswith("Tracked 10 of 10 frames;")
+
+
+def test_a_path_without_scale_has_no_metres(report_of: Make) -> None:
+    run = report_of(20, scale="free", truth=None, scores={})
+    number, caption = cards(run)[0]
+    assert number.endswith(" units")
+    assert caption == "path travelled, without scale"
+    assert ", scale fitted;" in verdict(report_of(20, scale="fitted")).text
 
 
 def test_pace_falls_back_on_the_estimates(report_of: Make) -> None:

@@ -196,6 +196,23 @@ def test_without_truth(report_of: Make) -> None:
     assert "nan" not in words(page).lower()
 
 
+def test_a_path_without_scale_is_in_units_of_its_own(report_of: Make) -> None:
+    free = render_report(report_of(30, truth=None, scores={}, samples=(), scale="free"))
+    assert "One camera cannot tell the scale: lengths are in units of their own." in words(free)
+    assert data_of(free)["unit"] == "units"
+    assert "x [units]" in free
+    assert "Position uncertainty, 3σ [units]" in free
+    assert " [m]" not in free
+    fitted = render_report(report_of(30, samples=(), scale="fitted"))
+    assert "the path is drawn at that of the truth" in words(fitted)
+    assert data_of(fitted)["unit"] == "m"
+
+
+def test_warnings_are_shown_as_text(report_of: Make) -> None:
+    page = render_report(report_of(9, samples=(), warnings=["is <b> it 5000?"]))
+    assert "<li>is &lt;b&gt; it 5000?</li>" in page
+
+
 def test_truth_of_another_clock(report_of: Make) -> None:
     run = report_of(30, scores={}, samples=())
     assert run.truth is not None

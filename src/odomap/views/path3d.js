@@ -127,7 +127,7 @@
   };
   const drawWords = () => {
     ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = palette.muted;
-    ctx.fillText("grid " + +step.toPrecision(3) + " m", 12, 22);
+    ctx.fillText("grid " + +step.toPrecision(3) + " " + data.unit, 12, 22);
     const at = [52, 66], size = 26;
     const o = [width / 2 + panX, height / 2 + panY - 14];
     [[1, 0, 0], [0, 1, 0], [0, 0, 1]].forEach((axis, k) => {

@@ -26,7 +26,10 @@ SURROUNDINGS = 10.0
 
 
 def path3d_data(
-    place: Scene, keyframe_stamps_ns: NDArray[np.int64], points: NDArray[np.float64] | None
+    place: Scene,
+    keyframe_stamps_ns: NDArray[np.int64],
+    points: NDArray[np.float64] | None,
+    unit: str = "m",
 ) -> str:
     """Pack a scene for the page's script.
 
@@ -34,6 +37,7 @@ def path3d_data(
         place: the path, and its truth.
         keyframe_stamps_ns: stamps of keyframes.
         points: (M, 3) landmarks in the estimate's world, metres, or None.
+        unit: what lengths are in; "units" where a path has no scale.
 
     Returns:
         JSON that is safe inside a script element.
@@ -52,6 +56,7 @@ def path3d_data(
     stamps = place.stamps_ns[keep]
     data = {
         "axes": _names(place, order, sign),
+        "unit": unit,
         "path": _packed(path),
         "truth": _packed(truth),
         "points": _packed(_landmarks(place, points)[:, order] * sign),

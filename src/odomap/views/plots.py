@@ -50,6 +50,7 @@ def path_figure(
     trajectory: Trajectory | None,
     truth: Trajectory | None = None,
     keyframe_stamps_ns: NDArray[np.int64] | None = None,
+    unit: str = "m",
 ) -> Figure:
     """Draw a path from above and from the side, coloured by its error where the truth is known.
 
@@ -57,6 +58,7 @@ def path_figure(
         trajectory: the path; None or empty gives a figure that says so.
         truth: ground truth, onto which the path is laid as well as a rigid motion can.
         keyframe_stamps_ns: stamps of the keyframes, marked on the path.
+        unit: what lengths are in; "units" where a path has no scale.
     """
     place = scene(trajectory, truth)
     if place is None:
@@ -69,7 +71,7 @@ def path_figure(
         (above, across, "From above"),
         (side, (wide, up), "From the side"),
     ):
-        dress(ax, title, f"{AXES[axes[0]]} [m]", f"{AXES[axes[1]]} [m]")
+        dress(ax, title, f"{AXES[axes[0]]} [{unit}]", f"{AXES[axes[1]]} [{unit}]")
         _draw_path(ax, place, axes, keyframe_stamps_ns)
         ax.set_aspect("equal", adjustable="datalim")
         if axes[1] == up and place.up_sign < 0:
@@ -169,14 +171,17 @@ def path_3d_figure(trajectory: Trajectory | None, truth: Trajectory | None = Non
     return figure
 
 
-def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None) -> Figure:
+def error_figure(
+    trajectory: Trajectory | None, truth: Trajectory | None = None, unit: str = "m"
+) -> Figure:
     """Draw the errors over time inside the ±3σ they claim; without truth, the 3σ alone.
 
     Errors are those of the body, in its own axes, relative to the first pose, as the covariance is.
+    A `unit` other than "m" is that of a path without scale, which is drawn as it is.
     """
     error = PathError.of(trajectory, truth)
     if error is None:
-        return _uncertainty(trajectory)
+        return _uncertainty(trajectory, unit)
     figure = new_figure(9.6, 5.0)
     grid = figure.subplots(3, 2, sharex=True, gridspec_kw={"wspace": 0.2, "hspace": 0.12})
     keep = thin(len(error.index), ERROR_POINTS)
@@ -202,7 +207,7 @@ def error_figure(trajectory: Trajectory | None, truth: Trajectory | None = None)
     return figure
 
 
-def _uncertainty(trajectory: Trajectory | None) -> Figure:
+def _uncertainty(trajectory: Trajectory | None, given: str) -> Figure:
     index = finite_part(trajectory)
     sigma = sigmas(trajectory, index) if trajectory is not None else None
     if trajectory is None or sigma is None or len(index) == 0:
@@ -214,7 +219,8 @@ def _uncertainty(trajectory: Trajectory | None) -> Figure:
     panels = zip(figure.subplots(1, 2), (0, 3), ("Position", "Rotation"))
     for ax, first, title in panels:
         three = 3.0 * np.sqrt((sigma[keep, first : first + 3] ** 2).sum(axis=1))
-        factor, unit = _scale(three, rotation=first == 3)
+        free = first == 0 and given != "m"
+        factor, unit = (1.0, given) if free else _scale(three, rotation=first == 3)
         dress(ax, f"{title} uncertainty, 3σ [{unit}]", "time [s]")
         three = gaps_as_nan(stamps, factor * three)
         ax.fill_between(t, 0.0, three, color=PALETTE["band"], lw=0)

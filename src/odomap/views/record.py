@@ -21,6 +21,7 @@ from odomap.maps.estimate import Estimate, Status
 __all__ = ["LostRun", "Report", "Sample", "Verdict", "environment", "lost_runs", "verdict"]
 
 Level = Literal["good", "warn", "bad"]
+Scale = Literal["metric", "fitted", "free"]
 PLACED = (Status.TRACKING, Status.RECOVERED)
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "matplotlib")
 
@@ -69,6 +70,9 @@ class Report:
         metrics: numbers of the run by name, one level of nesting, as in metrics.json.
         samples: a few frames with their pictures.
         skipped: (stamp_ns, file, reason) of every measurement that could not be used.
+        warnings: what a person should know, one sentence each.
+        scale: what lengths of path and landmarks are: metres, units of a single camera brought to
+            metres by the truth, or such units as they are.
         points: (M, 3) landmarks in the world, metres, or None.
         environment: versions and machine.
     """
@@ -86,6 +90,8 @@ class Report:
     metrics: Mapping[str, object] = field(default_factory=dict)
     samples: Sequence[Sample] = ()
     skipped: Sequence[tuple[int, str, str]] = ()
+    warnings: Sequence[str] = ()
+    scale: Scale = "metric"
     points: NDArray[np.float64] | None = None
     environment: Mapping[str, str] = field(default_factory=environment)
 
@@ -93,6 +99,11 @@ class Report:
     def has_path(self) -> bool:
         """Whether there is at least one pose to draw."""
         return self.trajectory is not None and len(self.trajectory) > 0
+
+    @property
+    def unit(self) -> str:
+        """What lengths of the path are in: metres, or units of its own."""
+        return "units" if self.scale == "free" else "m"
 
 
 @dataclass(frozen=True)
@@ -147,6 +158,12 @@ def verdict(report: Report) -> Verdict:
     total = len(report.estimates)
     placed = sum(e.status in PLACED for e in report.estimates)
     starting = sum(e.status is Status.INITIALIZING for e in report.estimates)
+    if placed and report.trajectory is not None:  # a start's first views are placed afterwards
+        known = set(report.trajectory.stamps_ns.tolist())
+        late = sum(
+            e.status is Status.INITIALIZING and e.stamp_ns in known for e in report.estimates
+        )
+        placed, starting = placed + late, starting - late
     parts = [_tracked(total, placed, starting)]
     runs = lost_runs(report.estimates)
     if runs and placed:
@@ -177,10 +194,11 @@ def _accuracy(report: Report) -> str:
     rmse = ate.get("rmse_m", math.nan)
     # The reference may go on long before and after the run: what was travelled is what counts.
     path = report.trajectory.path_length if report.trajectory is not None else math.nan
+    fitted = ", scale fitted" if report.scale == "fitted" else ""
     if math.isfinite(rmse) and path > 0:
-        return f"ATE {length(rmse)} over {length(path)} ({100 * rmse / path:.2g} %)"
+        return f"ATE {length(rmse)} over {length(path)} ({100 * rmse / path:.2g} %){fitted}"
     if math.isfinite(rmse):
-        return f"ATE {length(rmse)}"
+        return f"ATE {length(rmse)}{fitted}"
     return "" if report.truth is not None or not report.has_path else "no ground truth to judge it"
 
 

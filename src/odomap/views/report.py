@@ -22,6 +22,11 @@ __all__ = ["Report", "Sample", "render_report", "write_report"]
 
 SAMPLES = 8
 ROWS = 50
+SCALES = {
+    "metric": "",
+    "fitted": "One camera cannot tell the scale: the path is drawn at that of the truth. ",
+    "free": "One camera cannot tell the scale: lengths are in units of their own. ",
+}
 LEVELS = {"good": "Everything tracked", "warn": "Look at the problems", "bad": "It failed"}
 
 
@@ -85,8 +90,10 @@ def _path(report: Report) -> str:
     keyframes = np.array([e.stamp_ns for e in report.estimates if e.is_keyframe], np.int64)
     against = " against the true one" if place.truth is not None else ""
     label = f"The path{against}, from above and from the side"
-    flat_view = figure_svg(path_figure(report.trajectory, report.truth, keyframes), label)
-    caption = (
+    flat_view = figure_svg(
+        path_figure(report.trajectory, report.truth, keyframes, report.unit), label
+    )
+    caption = SCALES[report.scale] + (
         "The whole path is laid on the truth by the one rigid motion that fits best; "
         "its colour is the distance that remains."
         if place.truth is not None
@@ -107,7 +114,7 @@ browser with canvas.</canvas>
 <p class="note">Drag to turn, shift-drag to move, wheel to zoom, double-click to reset.</p>
 <noscript><p class="note">The interactive view needs JavaScript; nothing is loaded.</p></noscript>
 <script type="application/json" id="path3d-data">\
-{path3d_data(place, keyframes, report.points)}</script>"""
+{path3d_data(place, keyframes, report.points, report.unit)}</script>"""
 
 
 def _legend3d(coloured: bool, has_truth: bool, has_points: bool) -> str:
@@ -140,7 +147,7 @@ def _error(report: Report) -> str:
         )
         if error.sigmas is not None:
             caption += f" {_inside(error.errors, error.sigmas)}"
-    svg = figure_svg(error_figure(report.trajectory, report.truth), label)
+    svg = figure_svg(error_figure(report.trajectory, report.truth, report.unit), label)
     return f"<figure>{svg}<figcaption>{text(caption)}</figcaption></figure>{_scores(report)}"
 
 
@@ -252,6 +259,9 @@ def _problems(report: Report) -> str:
         ]
         head = ["At", "File", "Reason"]
         parts.append("<h3>Skipped</h3>" + table(head, rows, numbers=[0]) + _more(report.skipped))
+    if report.warnings:
+        items = "".join(f"<li>{text(warning)}</li>" for warning in report.warnings)
+        parts.append(f"<h3>Warnings</h3><ul>{items}</ul>")
     if report.estimates and not report.has_path:
         parts.append("<p>No frame was tracked; the reasons are those of the lost frames.</p>")
     return "\n".join(parts) or '<p class="note">None: no frame was lost, no image skipped.</p>'

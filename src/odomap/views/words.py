@@ -25,6 +25,7 @@ NAMES = {
     "rmse_pct_of_path": "rmse",
     "path_m": "length of path",
     "ms_per_frame": "time per frame,",
+    "path_units": "length of path, without scale",
     "skipped": "images skipped",
 }
 CARDS = {
@@ -83,7 +84,10 @@ def cards(report: Report) -> list[tuple[str, str]]:
     if math.isfinite(rmse):
         out.append((length(rmse), "ATE RMSE"))
     if report.trajectory is not None and len(report.trajectory) > 1:
-        out.append((length(report.trajectory.path_length), "path travelled"))
+        path = float(report.trajectory.path_length)
+        free = report.scale == "free"
+        shown = f"{significant(path, 2)} {report.unit}" if free else length(path)
+        out.append((shown, "path travelled, without scale" if free else "path travelled"))
     pace = report.metrics.get("ms_per_frame")
     if isinstance(pace, Mapping):
         for key, caption in (("median", "per frame, median"), ("p95", "per frame, 95 %")):
