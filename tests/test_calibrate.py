@@ -229,6 +229,16 @@ def test_pictures_without_any_board(refused, tmp_path: Path) -> None:
     assert "INNER corners" in message
 
 
+def test_bricks_are_not_taken_for_a_board(refused) -> None:
+    from odomap.simulation.world import World
+
+    world = World.make(kind="room", seed=4, frames=50, sensors=("mono",))
+    Path("walk").mkdir()
+    for k in range(0, 48, 8):
+        cv2.imwrite(f"walk/{k}.png", world.frame(k).images[0])
+    assert "and are there 9x6 INNER corners?" in refused("walk", *BOARD)
+
+
 def test_too_few_views(refused, pictures: Path) -> None:
     files = sorted(pictures.iterdir())
     assert "seen in only 2 of 2 pictures: 3 are the least" in refused(*files[:2], *BOARD)

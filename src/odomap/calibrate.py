@@ -38,6 +38,8 @@ MOST_FRAMES = 60
 LOOK = 8
 """Pictures in which to look for a board of another size."""
 ROLES = ("left", "right")
+LEAST = 20
+"""Corners that a board of another size must have to be suggested."""
 
 
 @dataclass(frozen=True)
@@ -230,8 +232,11 @@ def _check_seen(search: _Search, board: "Board") -> None:
     mend = f"is it whole, with a white margin, and are there {board} INNER corners?"
     mine = max(board.columns, board.rows), min(board.columns, board.rows)
     others = Counter(size for size in search.sizes if size != mine)
-    if others:
-        (columns, rows), _ = max(others.items(), key=lambda item: (item[1], item[0]))
+    (columns, rows), times = max(
+        others.items(), key=lambda item: (item[1], item[0]), default=((0, 0), 0)
+    )
+    # Bricks and shelves look like small boards, and in each picture like another one.
+    if columns * rows >= LEAST and 2 * times >= min(LOOK, readable):
         mend = (
             f"looks like a {columns}x{rows} board: give --board {columns}x{rows} (inner corners, "
             "one less than squares along each side)"
