@@ -323,6 +323,21 @@ def test_info_and_eval_of_a_run(cli, recording, tmp_path):
     assert {"eval.json", "path.png", "error.png"} <= {p.name for p in (tmp_path / "e").iterdir()}
 
 
+def test_a_path_without_scale_is_told_how_to_be_judged(cli, recording, tmp_path):
+    cli("run", recording, "--out", "a")
+    lines = (tmp_path / "a" / "trajectory.tum").read_text().splitlines()[1:]
+    rows = [line.split() for line in lines]
+    small = [[row[0], *(str(float(v) / 5) for v in row[1:4]), *row[4:]] for row in rows]
+    Path("small.tum").write_text("".join(" ".join(row) + "\n" for row in small))
+    code, _, err = cli("eval", "small.tum", recording)
+    assert code == 0
+    assert re.search(r"the reference is (4\.9|5)\S* times as large as the path.*--align sim3", err)
+    code, _, err = cli("eval", "small.tum", recording, "--align", "sim3", "--out", "e")
+    assert code == 0
+    assert "give --align" not in err
+    assert "give --align" not in cli("eval", "a/trajectory.tum", recording)[2]
+
+
 # ---- bad input: what is there ----
 
 

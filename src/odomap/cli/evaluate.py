@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Evaluate"]
 
+SCALED = 0.5
+"""A fitted scale that leaves less than this share of the error, and is as far from 1, is said."""
+
 
 @dataclass(frozen=True)
 class Evaluate:
@@ -57,6 +60,7 @@ class Evaluate:
         else:
             reference = read_reference(self.reference)
             table = self._metrics(estimate, reference)
+            estimate = self._scaled(estimate, reference)
         if self.json:
             print(table.to_json())
         else:
@@ -91,6 +95,29 @@ class Evaluate:
             except InputError as error:
                 print(f"odomap: no KITTI segments: {error}", file=sys.stderr)
         return Table.of({self.estimate.name: groups})
+
+    def _scaled(self, estimate: "Trajectory", reference: "Trajectory") -> "Trajectory":
+        """Return the path at the scale that was fitted, to draw; say if one should have been."""
+        import numpy as np
+
+        from odomap.errors import InputError
+        from odomap.evaluation.metrics import ate
+        from odomap.geometry.pose import Sim3
+
+        try:
+            fitted = ate(estimate, reference, "sim3", self.max_dt)
+        except InputError:
+            return estimate  # a path that stands still has no scale to speak of
+        if self.align == "sim3":
+            return estimate.transformed(Sim3.from_parts(fitted.scale, np.eye(3), np.zeros(3)))
+        rigid = ate(estimate, reference, "se3", self.max_dt)
+        if fitted.rmse < SCALED * rigid.rmse and abs(fitted.scale - 1.0) > 1.0 - SCALED:
+            print(
+                f"odomap: the reference is {fitted.scale:.3g} times as large as the path: if that "
+                "is of one camera, which has no scale, give --align sim3",
+                file=sys.stderr,
+            )
+        return estimate
 
     def _write(
         self, table: "Table", estimate: "Trajectory", reference: "Trajectory | None"

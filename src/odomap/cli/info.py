@@ -80,7 +80,7 @@ def lines(facts: dict[str, Any]) -> list[str]:
     if facts["imu_rate_hz"]:
         rows.append(("imu", f"{facts['imu_rate_hz']:g} Hz"))
     rows += [("lidar", name) for name in facts["lidars"]]
-    rows.append(("body", facts["body"]))
+    rows.append(("body", facts["body"] or "a frame of its own, none of these sensors"))
     rows.append(("ground truth", _truth(facts)))
     for gap in facts["gaps"][:10]:
         rows.append(("gap", f"{gap['gap_s']:.3f} s after frame {gap['after_frame']}"))
