@@ -258,6 +258,22 @@ def test_depth_of_another_clock(tum: Write) -> None:
     assert "begins 3600 s after colour: if their clocks differ by that" in text
 
 
+def test_depth_that_is_shifted_by_whole_frames(tum: Write) -> None:
+    root = tum(lag_ns=5 * 33_333_333)  # each depth pairs well, with the colour of another time
+    notes = TumSource(root).notes
+    assert notes[0].startswith("depth.txt: depth begins 0.167 s after colour, and ends 0.167 s")
+    assert "clocks differ" in notes[0]
+    assert "5 of 8 colour images have no depth" in notes[1]
+
+
+def test_a_bad_row_names_its_file(tum: Write) -> None:
+    root = tum()
+    (root / "rgb.txt").write_text((root / "rgb.txt").read_text() + "hello world\n")
+    (skipped,) = TumSource(root).skipped
+    assert skipped.file == str(root / "rgb.txt")
+    assert skipped.reason.endswith("stamp 'hello' is not a number")
+
+
 def test_depth_that_lags(tum: Write) -> None:
     root = tum(lag_ns=12_000_000)
     (note,) = TumSource(root).notes

@@ -38,6 +38,8 @@ RATE_HZ = 30.0
 FACTOR = 5000.0
 LAG = 0.25
 """Share of a frame period from which on a constant offset of depth is noted."""
+SHIFT = 3.0
+"""Periods by which depth begins and ends later, or earlier, if it is of another clock."""
 FREIBURG = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -148,6 +150,9 @@ def _read_list(root: Path, kind: str, rate_hz: float, notes: list[str]) -> Listi
         notes.append(f"{kind}.txt is missing: stamps are taken from the names of the images")
         rows = [(0, Path(name).stem, f"{kind}/{name}") for name in names]
     listing = list_rows(rows, "s", rate_hz or RATE_HZ, file, file.name)
+    if file.is_file():  # it is the row that is wrong, not the image it names
+        bad = [replace(item, file=str(file)) for item in listing.skipped]
+        listing = replace(listing, skipped=bad)
     notes += listing.notes
     return listing
 
@@ -169,6 +174,12 @@ def _open_depth(
     note = probe_depth(paths, mount, resolution, where)
     notes += [note] if note else []
     return replace(rig, depth=mount), DepthFiles(root, names, offsets, mount, resolution)
+
+
+def _is_shift(begins_s: float, ends_s: float, step_s: float) -> bool:
+    """Tell whether one listing is the other one later or earlier, by more than a few frames."""
+    least = min(abs(begins_s), abs(ends_s))
+    return least > SHIFT * step_s and abs(begins_s - ends_s) < SHIFT * step_s
 
 
 def _pair(
@@ -194,6 +205,13 @@ def _pair(
             f"depth.txt: depth is {abs(lag) * 1e-6:.3g} ms {'behind' if lag > 0 else 'ahead of'} "
             f"colour in most frames ({step * 1e-6:.3g} ms apart): are they synchronised? Set "
             f"'time_offset_s: {lag * 1e-9:.4f}' of the camera in a rig.yaml if its clock is off"
+        )
+    begins, ends = ((depth_ns[k] - colour_ns[k]) * 1e-9 for k in (0, -1))
+    if _is_shift(begins, ends, step * 1e-9):
+        notes.append(
+            f"depth.txt: depth begins {abs(begins):.3g} s {'after' if begins > 0 else 'before'} "
+            f"colour, and ends {abs(ends):.3g} s {'after' if ends > 0 else 'before'} it: do their "
+            "clocks differ? Then shift the stamps of one of the two"
         )
     if alone:
         notes.append(
