@@ -29,7 +29,7 @@ class Demo:
     """Which of them: every seed is another world and another path."""
     frames: int = 120
     """How many frames to render."""
-    open: bool = True
+    open: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Only write the report, do not open it in a browser."""
     quiet: bool = False
     """No progress."""

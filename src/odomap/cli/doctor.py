@@ -2,6 +2,9 @@
 
 import sys
 from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
 
 __all__ = ["Doctor"]
 
@@ -12,7 +15,7 @@ MARKS = {"ok": "ok", "note": "--", "broken": "!!"}
 class Doctor:
     """Say what is installed, what is missing and how to mend it; compile all kernels."""
 
-    kernels: bool = True
+    kernels: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Do not compile the kernels."""
     clear: bool = False
     """Delete the compiled kernels first."""

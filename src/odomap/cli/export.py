@@ -34,7 +34,7 @@ class Export:
     """The recording, if it is no longer where the run found it."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml, if it is no longer where the run found it."""
-    picture: bool = True
+    picture: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Do not draw the mesh."""
     quiet: bool = False
     """No progress."""
