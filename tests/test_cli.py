@@ -150,6 +150,7 @@ def test_no_words_prints_help_and_fails(cli):
         (["run", "x", "--rhythm", "fast"], "invalid choice 'fast'"),
         (["run", "x", "--preset", "stero"], "preset 'stero' is unknown (did you mean 'stereo'?)"),
         (["run", "x", "--config", "none.yaml"], "none.yaml: cannot be read"),
+        (["config", "--candidates.views", "0"], "candidates.views: 0 must be above 0"),
         (["run", "sim:room?frames=3", "--max-frames", "0"], "max_frames is 0"),
         (["info", "x", "--tracking.min_inliers", "3"], "unknown option"),
         (["eval", "a"], "REFERENCE is missing"),

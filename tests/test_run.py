@@ -325,3 +325,19 @@ def test_a_camera_that_never_moves_fails_with_the_reason():
     assert "0 of 6 frames have a pose" in result.failure
     assert "move the camera sideways" in result.failure
     assert result.metrics["keyframes"] == 0
+
+
+def test_a_frame_that_cannot_be_loses_nothing_of_those_before(world, tmp_path):
+    from dataclasses import replace
+
+    def shrunk(frame):
+        if frame.id < 6:
+            return frame
+        return replace(frame, images=tuple(np.ascontiguousarray(i[::2, ::2]) for i in frame.images))
+
+    with pytest.raises(CalibrationError, match=r"^sim:room.*frame 6: the image is .*before is in"):
+        run(Edited(world, shrunk), tmp_path)
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 6
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["failure"].startswith("tracking stopped: frame 6")
+    assert (tmp_path / "report.html").exists()

@@ -2,15 +2,23 @@
 
 import enum
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal, get_type_hints
 
 import pytest
 
 from odomap.errors import ConfigError
+from odomap.limits import Limits, check_limits
 from odomap.settings import config_to_yaml, field_docs, override, read_config
-from odomap.system.config import PRESETS, preset
+from odomap.system.config import PRESETS, Config, preset
+
+NUMBERS = [
+    (section.name, name)
+    for section in fields(Config)
+    for name, hint in get_type_hints(section.type).items()
+    if hint in (int, float)
+]
 
 
 class Mode(enum.StrEnum):
@@ -22,7 +30,7 @@ class Mode(enum.StrEnum):
 class Section:
     """A section."""
 
-    count: int = 4
+    count: Annotated[int, Limits(least=1)] = 4
     """How many, at least 1."""
     gain: float = 1e-5
     """A small number, no unit."""
@@ -37,8 +45,9 @@ class Section:
     folder: Path = Path("a")
 
     def __post_init__(self):
-        if self.count < 1:
-            raise ConfigError(f"field 'count' is {self.count}: at least 1 expected")
+        check_limits(self)
+        if self.pair[0] > self.pair[1]:
+            raise ConfigError("pair: the first must not be above the second")
 
 
 @dataclass(frozen=True)
@@ -98,7 +107,8 @@ def test_what_a_file_does_not_say_stays(tmp_path):
         ("section: {mode: mid}", "one of fast, slow expected"),
         ("section: {pair: [1]}", "has 1 values, 2 expected"),
         ("section: {active: 1}", "true or false expected"),
-        ("section: {count: 0}", "field 'count' is 0: at least 1 expected"),
+        ("section: {count: 0}", ": section.count: 0 must be at least 1"),
+        ("section: {pair: [2, 1]}", ": section.pair: the first must not be above the second"),
         ("section: 3", "'section' is a section"),
         ("- 1", "expected 'section:' lines"),
         ("a: [", "line 1: not YAML"),
@@ -138,10 +148,58 @@ def test_presets_survive_the_file(name, tmp_path):
 
 
 def test_every_field_of_every_section_is_explained():
-    from dataclasses import fields
-
     config = preset(next(iter(PRESETS)))
     for section in fields(config):
         value = getattr(config, section.name)
         missing = {f.name for f in fields(value)} - set(field_docs(type(value)))
         assert not missing, f"{type(value).__name__}: no docstring under {missing}"
+
+
+@pytest.mark.parametrize(("section", "name"), NUMBERS)
+def test_every_number_of_every_section_has_limits(section, name):
+    made = getattr(Config(), section)
+    for value in (math.nan, math.inf, -1_000_000):
+        with pytest.raises(ConfigError, match=rf"^{name}: {value} must be "):
+            replace(made, **{name: value})
+    with pytest.raises(
+        ConfigError, match=rf"^command line: {section}\.{name}: -1000000(\.0)? must "
+    ):
+        override(Config(), [(f"{section}.{name}", "-1000000")])
+
+
+def test_numbers_of_sections_are_found():
+    assert {section for section, _ in NUMBERS} == {section.name for section in fields(Config)}
+    assert ("features", "count") in NUMBERS
+
+
+@pytest.mark.parametrize(
+    ("limits", "inside", "outside", "words"),
+    [
+        (Limits(above=0), (1, 1e-300), (0, -1), "above 0"),
+        (Limits(least=8), (8, 9), (7, 7.999), "at least 8"),
+        (Limits(above=0, most=180), (1e-9, 180), (0, 180.1), "above 0 and at most 180"),
+        (Limits(least=-1, most=1), (-1, 0, 1), (-1.1, 1.1), "at least -1 and at most 1"),
+        (Limits(), (-1e300, 0), (), ""),
+    ],
+)
+def test_limits(limits, inside, outside, words):
+    assert all(limits.admit(value) for value in inside)
+    assert not any(limits.admit(value) for value in (*outside, math.nan, math.inf, -math.inf))
+    assert str(limits) == words
+
+
+def test_the_nearest_depth_is_below_the_farthest():
+    with pytest.raises(ConfigError, match=r"depth\.nearest: 8\.0 must be below farthest, 8\.0$"):
+        override(Config(), [("depth.nearest", "8")])
+
+
+def test_overrides_count_together():
+    """The first alone would put the nearest depth beyond the farthest."""
+    config = override(Config(), [("depth.nearest", "9"), ("depth.farthest", "20")])
+    assert (config.depth.nearest, config.depth.farthest) == (9.0, 20.0)
+    config = override(Config(), [("depth.noise", "1"), ("flow.levels", "2"), ("depth.noise", "3")])
+    assert (config.depth.noise, config.flow.levels) == (3.0, 2)
+    assert override(Config(), []) == Config()
+    for twice in (["depth", "depth.noise"], ["depth.noise", "depth"]):
+        with pytest.raises(ConfigError, match="'depth' is given as a value and as a section"):
+            override(Config(), [(name, "1") for name in twice])

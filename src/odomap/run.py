@@ -153,11 +153,16 @@ def run(
     with deferred_interrupt() as interrupt:
         try:
             system = _system(source, settings, rhythm)
-            result = _track(source, system, logbook, outputs, max_frames, tell, interrupt)
+            broken = _track(source, system, logbook, outputs, max_frames, tell, interrupt)
         except CalibrationError as error:  # found while tracking: say of which recording
             raise CalibrationError(f"{head['data']}: {error}") from error
-        state = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
-        finished = _concluded(source, logbook, result, outputs, state, tell)
+        state: dict[str, object] = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
+        if broken is not None:
+            state["failure"] = f"tracking stopped: {broken}"
+        finished = _concluded(source, logbook, system.finish(), outputs, state, tell)
+    if broken is not None:
+        kept = "" if outputs is None else f"; what was tracked before is in {outputs.folder}"
+        raise type(broken)(f"{head['data']}: {broken}{kept}") from broken
     if interrupt.is_set():
         raise Interrupted(finished)
     return finished
@@ -234,13 +239,25 @@ def _track(
     max_frames: int | None,
     tell: Callable[[Progress], None],
     interrupt: threading.Event,
-) -> "Result":
-    """Track frame after frame until the source, the limit or the user ends it."""
+) -> CalibrationError | None:
+    """Track frame after frame until the source, the limit or the user ends it.
+
+    Returns:
+        What a frame in the middle said against the rig, for which the path so far is not to blame.
+
+    Raises:
+        CalibrationError: the same, before there is a path.
+    """
     total, frames = _expected(source, max_frames), iter(source)
     try:
         for frame in frames:
             start = time.perf_counter()
-            estimate = system.worker.advance(frame)
+            try:
+                estimate = system.worker.advance(frame)
+            except CalibrationError as error:
+                if logbook.placed:
+                    return error
+                raise
             logbook.add(frame, estimate, time.perf_counter() - start)
             if outputs is not None:
                 outputs.append(estimate)
@@ -251,7 +268,7 @@ def _track(
     finally:
         if isinstance(frames, Generator):
             frames.close()  # a camera is let go, and says what there is to say of it
-    return system.finish()
+    return None
 
 
 def _expected(source: "Source", max_frames: int | None) -> int:

@@ -2,8 +2,9 @@
 
 Every section of a config is a frozen dataclass with a docstring under each field. Writing turns
 those docstrings into comments; reading checks names (the nearest one is suggested), types and, by
-making the dataclasses anew, ranges. One path serves files and command-line overrides, so both give
-the same errors. Works on any tree of dataclasses: sections added later need nothing here.
+making the dataclasses anew, ranges (`odomap.limits`). One path serves files and command-line
+overrides, so both give the same errors. Works on any tree of dataclasses: sections added later need
+nothing here.
 """
 
 import ast
@@ -157,6 +158,7 @@ def override(config: T, assignments: Sequence[tuple[str, str]]) -> T:
     """
     import yaml
 
+    changes: dict[str, object] = {}
     for dotted, text in assignments:
         try:
             value = yaml.safe_load(text)
@@ -166,8 +168,22 @@ def override(config: T, assignments: Sequence[tuple[str, str]]) -> T:
         for name in reversed(dotted.split(".")):
             nested = {name: nested}
         assert isinstance(nested, dict)
-        config = updated(config, nested, "command line")
-    return config
+        changes = _merged(changes, nested)
+    # All at once: of two fields that bound each other, the first alone may not fit the other.
+    return updated(config, changes, "command line")
+
+
+def _merged(first: Mapping[str, object], then: Mapping[str, object]) -> dict[str, object]:
+    """Return both mappings in one, nested ones too; where they disagree, the later counts."""
+    merged = dict(first)
+    for name, value in then.items():
+        before = merged.get(name, value)
+        if isinstance(before, Mapping) and isinstance(value, Mapping):
+            value = _merged(before, value)
+        elif isinstance(before, Mapping) or isinstance(value, Mapping):
+            raise ConfigError(f"command line: '{name}' is given as a value and as a section")
+        merged[name] = value
+    return merged
 
 
 def updated(section: T, values: Mapping[Any, object], where: str, path: str = "") -> T:
@@ -199,7 +215,7 @@ def updated(section: T, values: Mapping[Any, object], where: str, path: str = ""
     try:
         return dataclasses.replace(section, **changes)  # type: ignore[type-var]
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error
+        raise ConfigError(f"{where}: {path}{error}") from error
     except ValueError as error:
         raise ConfigError(f"{where}: section '{path.rstrip('.')}': {error}") from error
 

@@ -14,6 +14,7 @@ Time Localization and 3D Reconstruction", CVPR 2006 (windows).
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from odomap.backend.schur import (
 from odomap.errors import InputError
 from odomap.geometry.lie_kernels import se3_retract
 from odomap.kernels import kernel
+from odomap.limits import Limits, NotNegative, Positive, check_limits
 
 __all__ = ["Bundle", "BundleConfig", "BundleSolution", "solve_bundle", "warm_up"]
 
@@ -45,12 +47,15 @@ REASONS = ("iteration limit", "converged", "no step lowers the cost", "the syste
 class BundleConfig:
     """How a bundle is solved."""
 
-    iterations: int = 4
+    iterations: Annotated[int, Limits(least=0)] = 4
     """Most Levenberg-Marquardt steps tried."""
-    huber_width: float = 2.5
+    huber_width: Positive = 2.5
     """Residual, in standard deviations, beyond which Huber's loss grows linearly."""
-    tolerance: float = 3e-3
+    tolerance: NotNegative = 3e-3
     """Relative decrease of the cost below which the solver stops."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True)

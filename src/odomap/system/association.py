@@ -10,11 +10,12 @@ Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Mo
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.limits import Count, Fraction, Limits, NotNegative, check_limits
 from odomap.vision.features import Corners, FeatureConfig, describe, detect
 from odomap.vision.flow import FlowConfig, pyramid, track
 from odomap.vision.matching import MatchConfig, match_guided
@@ -39,18 +40,21 @@ class TrackingConfig:
     """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image."""
     association: Literal["flow", "descriptors"] = "flow"
     """flow: patches followed by optical flow; descriptors: features matched in every frame."""
-    min_inliers: int = 15
+    min_inliers: Annotated[int, Limits(least=4)] = 15
     """Observations that must agree with a pose for it to count as tracked."""
-    keyframe_ratio: float = 0.85
+    keyframe_ratio: Fraction = 0.85
     """A keyframe is made when inliers fall below this fraction of those just after the last one."""
-    keyframe_motion: float = 0.04
+    keyframe_motion: NotNegative = 0.04
     """A keyframe is made when points have moved by this fraction of the image width (median)."""
-    keyframe_interval: int = 20
+    keyframe_interval: Count = 20
     """A keyframe is made after this many frames in any case."""
-    patience: int = 5
+    patience: Annotated[int, Limits(least=0)] = 5
     """Frames that may be lost before odometry starts anew."""
-    max_prediction_s: float = 0.3
+    max_prediction_s: NotNegative = 0.3
     """Velocity is trusted for this long; after a longer gap it is not extrapolated further."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True)

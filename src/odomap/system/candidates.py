@@ -15,6 +15,7 @@ Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from scipy.spatial import cKDTree
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.geometry.triangulate import triangulate
+from odomap.limits import Count, Limits, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.system.association import Association, Candidates, Reference, View
 from odomap.system.firstsight import FirstSights
@@ -43,12 +45,15 @@ class CandidateConfig:
 
     follow: bool = False
     """Whether they are followed; if not, only corners with a measured depth are of use."""
-    min_parallax_deg: float = 1.0
+    min_parallax_deg: Annotated[float, Limits(above=0, most=180)] = 1.0
     """Angle between two rays from which on they are triangulated."""
-    max_error_px: float = 1.5
+    max_error_px: Positive = 1.5
     """Largest distance of the point's projections from where it was seen (root mean square)."""
-    views: int = 5
+    views: Count = 5
     """Keyframes over which one is followed; after that it starts afresh."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

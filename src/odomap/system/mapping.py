@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bundle
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
+from odomap.limits import Count, Positive, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
@@ -35,12 +36,15 @@ Array = NDArray[np.float64]
 class WindowConfig:
     """The window of keyframes adjusted together."""
 
-    size: int = 7
+    size: Count = 7
     """Keyframes adjusted."""
-    fixed: int = 2
+    fixed: Count = 2
     """Older keyframes that hold them in place."""
-    gate: float = 3.5
+    gate: Positive = 3.5
     """Residual, in standard deviations, beyond which an observation is dropped."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 class WindowMapper:

@@ -23,18 +23,20 @@ from odomap.sensors.frame import Frame
 from odomap.system.association import Association, Reference, View
 from odomap.system.config import Config
 from odomap.system.eye import Eye
+from odomap.system.following import FollowedCorners
 from odomap.system.keyframing import Keyframes
 from odomap.system.path import Placed
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.vision.bootstrap import BetweenView, TwoViewMotion, two_view_motion
-from odomap.vision.turning import Thumbnail, turn_between
 
 __all__ = ["OneViewStart", "Start", "Started", "TwoViewsStart", "Waiting"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-MOST_BETWEEN = 60
+MATCH_PATIENCE = 5
+"""Views in a row in which a corner known by its descriptor may be missed."""
+MOST_BETWEEN = 300
 """Frames between the two views that are remembered, and placed afterwards."""
 MORE_PARALLAX = 1.2
 """By how much the parallax must grow before two views are tried again."""
@@ -153,38 +155,39 @@ class TwoViewsStart:
     ) -> None:
         self._map, self._eye, self._keyframes = map, eye, keyframes
         self._association, self._config = association, config
-        self._first: View | None = None
-        self._last: View | None = None
-        # Of all corners of the first view: where, and how they look.
-        self._corners, self._descriptors = np.empty((0, 2)), np.empty((0, 0), np.uint8)
-        # Of those followed until the last view: which corners, where now, and the last step.
-        self._alive, self._pixels = np.empty(0, np.int64), np.empty((0, 2))
-        self._flow = np.empty((0, 2))
+        self._corners: FollowedCorners | None = None
         self._between: list[_Between] = []
         self._needed_px = config.bootstrap.min_parallax_px
 
     def forget(self) -> None:
         """Drop the first view."""
-        self._first, self._between = None, []
+        self._corners, self._between = None, []
 
     def begin(
         self, frame: Frame, view: View, T_world_body: Array, covariance: Array
     ) -> Started | Waiting:
         """Follow the corners of the first view; start when they tell the motion."""
-        if self._first is None:
+        if self._corners is None:
             return self._look(view)
-        self._follow(self._first, view)
-        if len(self._alive) < max(self._config.bootstrap.min_points, 0.4 * len(self._corners)):
+        corners = self._corners
+        corners.follow(view)
+        if len(corners.found) < max(self._config.bootstrap.min_points, 0.4 * len(corners)):
             again = self._look(view)
             return Waiting(f"the view changed before the motion was known; {again.reason}")
-        first, second = self._corners[self._alive], self._pixels
-        config = replace(self._config.bootstrap, min_parallax_px=self._needed_px)
-        found = two_view_motion(first, second, self._eye.camera, config, frame.id, self._views())
+        found = two_view_motion(
+            corners.corners[corners.found],
+            corners.pixels,
+            self._eye.camera,
+            replace(self._config.bootstrap, min_parallax_px=self._needed_px),
+            frame.id,
+            self._views(corners),
+        )
         started: Started | Waiting = Waiting(found.reason)
         if found.T_second_first is not None:
-            started = self._start(frame, view, T_world_body, covariance, *self._adjusted(found))
+            adjusted = self._adjusted(corners, found)
+            started = self._start(frame, view, T_world_body, covariance, corners, *adjusted)
         if isinstance(started, Waiting):
-            self._between.append(_Between(frame.stamp_ns, self._alive, self._pixels))
+            self._between.append(_Between(frame.stamp_ns, corners.found, corners.pixels))
             self._between = self._between[-MOST_BETWEEN:]
             if found.parallax_px >= self._needed_px:  # tried in vain: views farther apart say more
                 self._needed_px = MORE_PARALLAX * found.parallax_px
@@ -192,55 +195,27 @@ class TwoViewsStart:
 
     def _look(self, view: View) -> Waiting:
         """Take a view as the first."""
-        wanted = self._config.features.count
-        self._corners, self._descriptors = self._association.extend(view, np.empty((0, 2)), wanted)
-        self._pixels, self._alive = self._corners, np.arange(len(self._corners))
-        self._flow = np.zeros_like(self._pixels)
-        self._first, self._last, self._between = view, view, []
+        wanted, needed = self._config.features.count, 2 * self._config.bootstrap.min_points
+        corners, descriptors = self._association.extend(view, np.empty((0, 2)), wanted)
+        self.forget()
         self._needed_px = self._config.bootstrap.min_parallax_px
-        needed = 2 * self._config.bootstrap.min_points
-        if len(self._corners) < needed:
-            self._first = None
-            why = f"{len(self._corners)} corners of {needed} needed to start"
+        if len(corners) < needed:
+            why = f"{len(corners)} corners of {needed} needed to start"
             return Waiting(f"{why}: too dark or no texture?")
+        patience = 0 if self._config.tracking.association == "flow" else MATCH_PATIENCE
+        self._corners = FollowedCorners(
+            view, corners, descriptors, self._eye.camera, self._association, patience
+        )
         return Waiting("a first view is taken: move the camera sideways")
 
-    def _follow(self, first: View, view: View) -> None:
-        """Find the corners still alive: where they were heading, else as the image turned."""
-        pixels, found = self._find(first, view, self._pixels + self._flow, self._alive)
-        lost = np.flatnonzero(~found)
-        turned = self._turned(view)
-        if lost.size and turned is not None:
-            pixels[lost], found[lost] = self._find(first, view, turned[lost], self._alive[lost])
-        self._last = view
-        self._flow = (pixels - self._pixels)[found]
-        self._pixels, self._alive = pixels[found], self._alive[found]
-
-    def _find(
-        self, first: View, view: View, guess: Array, corners: Index
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        still = np.tile(np.eye(2), (len(corners), 1, 1))
-        known = self._corners[corners], self._descriptors[corners]
-        return self._association.find(first, *known, view, guess, still)
-
-    def _turned(self, view: View) -> Array | None:
-        """Return where the corners would be if the camera had only turned since the last view."""
-        assert self._last is not None
-        camera = self._eye.camera
-        before, now = (Thumbnail.of(v.pyramid[-1], camera) for v in (self._last, view))
-        R_before_now = turn_between(before, now)
-        if R_before_now is None:
-            return None
-        return camera.project(camera.unproject(self._pixels) @ R_before_now)
-
-    def _views(self) -> list[BetweenView]:
-        """Return the views between as rows of the corners alive now."""
-        at = np.full(len(self._corners), -1)
-        at[self._alive] = np.arange(len(self._alive))
+    def _views(self, corners: FollowedCorners) -> list[BetweenView]:
+        """Return the views between as rows of the corners found now."""
+        at = np.full(len(corners), -1)
+        at[corners.found] = np.arange(len(corners.found))
         views = [(at[b.rows], b.pixels) for b in self._between]
         return [BetweenView(rows[rows >= 0], pixels[rows >= 0]) for rows, pixels in views]
 
-    def _adjusted(self, found: TwoViewMotion) -> tuple[Array, Array]:
+    def _adjusted(self, corners: FollowedCorners, found: TwoViewMotion) -> tuple[Array, Array]:
         """Adjust two views and their points; return T_first_second and the points, NaN if wrong.
 
         The distance of the two is 1.
@@ -249,7 +224,7 @@ class TwoViewsStart:
         good = np.flatnonzero(np.isfinite(found.points_first[:, 0]))
         Ts = np.stack([np.eye(4), found.T_second_first.inverse().matrix])
         n, camera = len(good), self._eye.camera
-        pixels = np.concatenate([self._corners[self._alive[good]], self._pixels[good]])
+        pixels = np.concatenate([corners.corners[corners.found[good]], corners.pixels[good]])
         sigma = self._config.noise.position_px / camera.fx
         bundle = Bundle(
             Ts,
@@ -279,11 +254,11 @@ class TwoViewsStart:
         view: View,
         T_world_body: Array,
         covariance: Array,
+        corners: FollowedCorners,
         T_first_second: Array,
         points: Array,
     ) -> Started | Waiting:
         """Make keyframes of the two views, in a scale that fits what came before."""
-        assert self._first is not None
         in_second = (points - T_first_second[:3, 3]) @ T_first_second[:3, :3]
         good = np.isfinite(points[:, 0]) & (points[:, 2] > 0) & (in_second[:, 2] > 0)
         if good.sum() < self._config.bootstrap.min_points:
@@ -295,48 +270,47 @@ class TwoViewsStart:
         T_first_second = T_body_camera @ T_first_second @ T_camera_body
         points = scale * points @ T_body_camera[:3, :3].T + T_body_camera[:3, 3]
         points = np.where(good[:, None], points, np.nan)
-        first = self._first_keyframe(T_world_body, covariance, points)
-        placed = [Placed(self._first.stamp_ns, first.keyframe_id, np.eye(4), np.zeros((6, 6)))]
-        placed += self._placed_between(first.keyframe_id, points, T_first_second)
+        first = self._first_keyframe(T_world_body, covariance, corners, points)
+        placed = [Placed(corners.first.stamp_ns, first.keyframe_id, np.eye(4), np.zeros((6, 6)))]
+        placed += self._placed_between(first.keyframe_id, corners, points, T_first_second)
         rows = np.flatnonzero(good)
-        here = self._motion(points[rows], self._pixels[rows], T_first_second)
+        pixels = corners.pixels[rows]
+        here = self._motion(points[rows], pixels, T_first_second)
         Ad = se3_adjoint(se3_inverse(T_first_second))
         sure = Ad @ covariance @ Ad.T + self._config.noise.overlap * here.covariance
         T_world_second = T_world_body @ T_first_second
         index = np.arange(len(rows))
-        seen = self._keyframes.measure(
-            frame, view, T_world_second, first, index, self._pixels[rows]
-        )
+        seen = self._keyframes.measure(frame, view, T_world_second, first, index, pixels)
         second = self._keyframes.add(view, T_world_second, seen, first.keyframe_id, sure)
         placed.append(Placed(frame.stamp_ns, second.keyframe_id, np.eye(4), np.zeros((6, 6))))
         self.forget()
         return Started(second, tuple(placed), len(second.landmark_ids))
 
     def _usual_depth(self) -> float:
-        """Return the median depth of the last keyframe's landmarks; 1 before there is one."""
-        known = self._map.keyframe_ids
-        if not known.size:
-            return 1.0
-        last = int(known[-1])
-        T = self._map.T_world_body(last) @ self._eye.T_body_camera
-        points = self._map.points_world(self._map.observations_of(last)[0])
-        depth = (points - T[:3, 3]) @ T[:3, 2]
-        return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+        """Return the median depth of the last keyframe with landmarks; 1 before there is one."""
+        for keyframe_id in self._map.keyframe_ids[::-1].tolist():
+            T = self._map.T_world_body(keyframe_id) @ self._eye.T_body_camera
+            points = self._map.points_world(self._map.observations_of(keyframe_id)[0])
+            depth = (points - T[:3, 3]) @ T[:3, 2]
+            if (depth > 0).any():
+                return float(np.median(depth[depth > 0]))
+        return 1.0
 
-    def _first_keyframe(self, T_world_body: Array, covariance: Array, points: Array) -> Reference:
+    def _first_keyframe(
+        self, T_world_body: Array, covariance: Array, corners: FollowedCorners, points: Array
+    ) -> Reference:
         """Make the first view a keyframe, with what is triangulated as landmarks."""
-        assert self._first is not None
         points_world = points @ T_world_body[:3, :3].T + T_world_body[:3, 3]
-        pixels = self._corners[self._alive]
-        seen = self._keyframes.seen_first(self._first, pixels, points_world)
-        return self._keyframes.add(self._first, T_world_body, seen, -1, covariance)
+        pixels = corners.corners[corners.found]
+        seen = self._keyframes.seen_first(corners.first, pixels, points_world)
+        return self._keyframes.add(corners.first, T_world_body, seen, -1, covariance)
 
     def _placed_between(
-        self, keyframe_id: int, points: Array, T_first_second: Array
+        self, keyframe_id: int, corners: FollowedCorners, points: Array, T_first_second: Array
     ) -> list[Placed]:
         """Place the frames between the two views, from the landmarks they saw."""
-        of_corner = np.full((len(self._corners), 3), np.nan)
-        of_corner[self._alive] = points
+        of_corner = np.full((len(corners), 3), np.nan)
+        of_corner[corners.found] = points
         twist, placed = se3_log(T_first_second), []
         for k, between in enumerate(self._between):
             known = np.isfinite(of_corner[between.rows, 0])

@@ -88,6 +88,7 @@ class Tracker:
         self._locator = Locator(association, eye.camera, eye.T_body_camera, config.noise)
         self._reference: Reference | None = None
         self._last: View | None = None
+        self._newest_ns = -1
         self._epoch = map.epoch
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = 0
@@ -95,6 +96,9 @@ class Tracker:
     def track(self, frame: Frame) -> Estimate:
         """Place one frame; its keyframe, if it became one, is in the map when this returns."""
         clock = _Clock()
+        if frame.stamp_ns <= self._newest_ns:
+            return self._lose(frame, "its time is not after that of the frame before", clock)
+        self._newest_ns = frame.stamp_ns
         image = self._eye.image(frame)
         if image is None:
             return self._lose(frame, f"the {self._eye.name} image is missing", clock)
@@ -313,6 +317,8 @@ def _why_lost(located: Located, needed: int, view: View) -> str:
         cause = (
             f"the image is nearly uniform (contrast {contrast:.0f} of 255): covered lens, no light?"
         )
+    elif not located.expected:
+        cause = "none of the landmarks is where the camera is expected to look"
     elif len(located.rows) < needed:
         again = f"{len(located.rows)} of {located.expected} landmarks found again"
         cause = f"{again}: motion blur or too fast?"

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleSolution
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_adjoint, se3_inverse, sim3_adjoint
+from odomap.limits import NotNegative, Positive, check_limits
 
 __all__ = ["Calibration", "Drift", "NoiseConfig"]
 
@@ -45,13 +46,16 @@ LEAST_PARALLAX = 0.02
 class NoiseConfig:
     """How far what is measured may be off."""
 
-    position_px: float = 0.4
+    position_px: Positive = 0.4
     """Standard deviation of a tracked point's position."""
-    overlap: float = 4.0
+    overlap: Positive = 4.0
     """Factor on variances for errors that observations share: patches overlap, tracks go on."""
-    calibration_px: float = 0.15
+    calibration_px: NotNegative = 0.15
     """Standard deviation of the calibration: of disparities (offset, slopes), and of the camera's
     direction on the body."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ is nothing to triangulate, and a plane allows two motions that explain both view
 1. the parallax that no rotation explains is measured; below a threshold one waits;
 2. an essential matrix (any scene) and a homography (a plane) are fitted by RANSAC. Each stands for
    several motions, and all of them compete. The winner explains most of the matches by points ahead
-   of both cameras, with enough parallax;
+   of both cameras;
 3. where another motion explains nearly as much, the views between the two decide: the points of
    the right motion are seen where they should be from there as well. If they cannot tell, one
    waits.
@@ -18,6 +18,7 @@ Reference: Mur-Artal, Montiel, TardÃ³s, "ORB-SLAM", T-RO 2015, section IV; NistÃ
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from odomap.geometry.twoview import (
     relative_pose,
     sampson_distance,
 )
+from odomap.limits import Fraction, Limits, NotNegative, Positive, check_limits
 
 __all__ = [
     "BetweenView",
@@ -56,14 +58,17 @@ planes none was decided wrongly even at 0.95."""
 class BootstrapConfig:
     """When two views of one camera are enough to start."""
 
-    min_parallax_px: float = 1.5
+    min_parallax_px: NotNegative = 1.5
     """Median displacement that no rotation explains; several times the noise of a point."""
-    min_points: int = 60
+    min_points: Annotated[int, Limits(least=8)] = 60
     """Points that must be triangulated, and matches needed to try."""
-    max_error_px: float = 1.5
+    max_error_px: Positive = 1.5
     """Largest distance of a match from its epipolar line, or of a point from where it was seen."""
-    max_ambiguity: float = 0.85
+    max_ambiguity: Fraction = 0.85
     """Another motion must explain less than this share of the points of the best."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

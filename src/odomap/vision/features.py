@@ -13,13 +13,14 @@ high-speed corner detection", ECCV 2006.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
+from odomap.limits import Count, Limits, check_limits
 
 __all__ = [
     "Corners",
@@ -43,12 +44,15 @@ class FeatureConfig:
 
     detector: Detector = "fast"
     """Corner detector: fast, harris, orb or sift."""
-    count: int = 300
+    count: Count = 300
     """Features wanted per keyframe."""
-    threshold: int = 12
+    threshold: Annotated[int, Limits(least=1, most=255)] = 12
     """FAST contrast threshold, grey levels; halved once where too few corners pass."""
-    border_px: int = 12
+    border_px: Annotated[int, Limits(least=0)] = 12
     """Margin at the image border in which no feature is taken."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 @dataclass(frozen=True)

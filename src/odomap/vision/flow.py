@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.limits import Correlation, Count, NotNegative, check_limits
 from odomap.vision.patches import PRECISION_PX, Flow, align_patches
 
 __all__ = ["FlowConfig", "facing_warp", "pyramid", "track"]
@@ -33,16 +34,19 @@ COARSE_PRECISION_PX = 0.1
 class FlowConfig:
     """How points are followed from image to image."""
 
-    half_window_px: int = 6
+    half_window_px: Count = 6
     """Half the patch side: 6 gives 13x13 pixels."""
-    levels: int = 3
+    levels: Count = 3
     """Pyramid levels; each doubles the motion that can be followed."""
-    iterations: int = 12
+    iterations: Count = 12
     """Most Gauss-Newton steps per level."""
-    min_correlation: float = 0.75
+    min_correlation: Correlation = 0.75
     """Smallest normalised correlation of a patch with its template."""
-    max_backward_px: float = 0.7
+    max_backward_px: NotNegative = 0.7
     """Largest distance between a point and where tracking it back ends; 0 leaves the check out."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 def pyramid(image: Image, levels: int) -> tuple[Image, ...]:

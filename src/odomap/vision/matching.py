@@ -12,12 +12,14 @@ Reference: Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJ
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
+from odomap.limits import Fraction, Limits, NotNegative, Positive, check_limits
 
 __all__ = ["MatchConfig", "match_all", "match_guided", "warm_up"]
 
@@ -28,14 +30,17 @@ Descriptors = NDArray[np.uint8]
 class MatchConfig:
     """How descriptors are matched."""
 
-    radius_px: float = 24.0
+    radius_px: Positive = 24.0
     """Search radius around the expected position."""
-    ratio: float = 0.85
+    ratio: Fraction = 0.85
     """The best distance must be below this fraction of the second best."""
-    max_hamming: int = 64
+    max_hamming: Annotated[int, Limits(least=0, most=256)] = 64
     """Largest distance of binary descriptors, bits of 256."""
-    max_euclidean: float = 250.0
+    max_euclidean: NotNegative = 250.0
     """Largest distance of SIFT descriptors."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 def match_guided(

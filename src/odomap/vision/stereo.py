@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
+from odomap.limits import Correlation, Count, Fraction, NotNegative, Positive, check_limits
 from odomap.vision.patches import align_patches
 
 __all__ = ["StereoConfig", "match_sparse", "sgbm_disparity"]
@@ -36,20 +37,23 @@ class StereoConfig:
 
     method: Literal["sparse", "sgbm"] = "sparse"
     """sparse: sub-pixel matches of the features; sgbm: a dense map, looked up at the features."""
-    max_disparity_px: int = 128
+    max_disparity_px: Count = 128
     """Largest disparity searched; nearer points get no depth."""
-    half_search_px: int = 4
+    half_search_px: Count = 4
     """Half the side of the window in the search along the row."""
-    half_refine_px: int = 4
+    half_refine_px: Count = 4
     """Half the side of the patch in the sub-pixel step."""
-    uniqueness: float = 0.75
+    uniqueness: Fraction = 0.75
     """The best score must be below this fraction of the best score elsewhere on the row."""
-    min_correlation: float = 0.8
+    min_correlation: Correlation = 0.8
     """Smallest normalised correlation of the two patches."""
-    max_vertical_px: float = 0.5
+    max_vertical_px: NotNegative = 0.5
     """Largest distance of a match from its row."""
-    noise_px: float = 0.8
+    noise_px: Positive = 0.8
     """Standard deviation of a disparity."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
 
 def match_sparse(
