@@ -344,3 +344,11 @@ def test_disturbed_stream(plugged: type[Capture]) -> None:
     dropped = drop(CameraSource("camera:0"), [3])
     assert len(dropped) == 0
     assert [frame.id for frame in dropped] == [0, 1, 2, *range(4, 10)]
+
+
+def test_a_file_has_its_calibration_beside_it(clip: Make, calibrate: Make) -> None:
+    path = clip()
+    calibrate(path.with_suffix(".rig.yaml"), (128, 96))
+    assert CameraSource(f"camera:{path}").rig.cameras[0].camera.width == 128
+    with pytest.raises(InputError, match="there is no such file to play as a camera"):
+        CameraSource(f"camera:{path.with_name('other.mp4')}", CameraSource(f"camera:{path}").rig)

@@ -54,7 +54,8 @@ class CameraSource:
 
         Args:
             spec: "camera:0", "camera:/dev/video0", "camera:clip.mp4", with options behind a '?'.
-            rig: its calibration; without it, the rig.yaml in the folder one is in.
+            rig: its calibration; without it, what lies beside a file, as for a video, or the
+                rig.yaml in the folder one is in.
 
         Raises:
             InputError: it cannot be opened or gives no frames, or an option is unknown.
@@ -62,7 +63,11 @@ class CameraSource:
         """
         self.name = spec
         self._place, self._asked = _parse(spec)
-        self.rig = one_camera(find_rig(rig, [Path("rig.yaml")], spec), spec)
+        here = [Path("rig.yaml")]
+        if Path(self._place).is_file():  # as for a video that is not played as a camera
+            file = Path(self._place)
+            here = [file.with_suffix(".rig.yaml"), file.with_name("rig.yaml"), *here]
+        self.rig = one_camera(find_rig(rig, here, spec), spec)
         self.truth: Trajectory | None = None
         self.skipped: list[Skipped] = []
         self.notes: list[str] = []
@@ -194,4 +199,6 @@ def _open_device(place: str, mount: CameraMount, asked: dict[str, float]) -> Dev
         if asked:
             raise InputError(f"{place}: is a file, which is played as it is: leave the options out")
         return FileDevice(Path(place), mount)
+    if Path(place).suffix and not Path(place).exists():
+        raise InputError(f"{place}: there is no such file to play as a camera")
     return VideoDevice(place, mount, asked)
