@@ -35,7 +35,6 @@ HERE = Path(__file__).parent
 BASELINE = HERE / "baseline.json"
 LARGEST_TIME_RATIO = 0.7
 """Of a stereo frame's time, ours over the peer's."""
-LEAST_RATE_HZ = 30.0
 SHOWN = {
     "ate_m": ("ATE RMSE, m", ".4f"),
     "tracked": ("frames tracked", ".0f"),
@@ -60,6 +59,7 @@ class Recording:
         largest_ate_m: bar for the error.
         least_frames: bar for the frames with a pose at the end.
         truth: file of the ground truth.
+        least_rate_hz: bar for the frames per second; images of KITTI are larger, and come at 10 Hz.
     """
 
     name: str
@@ -69,6 +69,7 @@ class Recording:
     largest_ate_m: float
     least_frames: int
     truth: str = "groundtruth.txt"
+    least_rate_hz: float = 30.0
 
 
 RECORDINGS = {
@@ -77,7 +78,7 @@ RECORDINGS = {
         Recording("euroc_mh01", "euroc_mh01", "euroc", "stereo", 0.0055, 110),
         Recording("kitti_stereo", "kitti_stereo", "kitti", "stereo", 0.11, 51),
         Recording("euroc_mono", "euroc_mh01", "euroc", "mono", 0.010, 102, "groundtruth_cam0.txt"),
-        Recording("kitti_mono", "kitti_mono", "kitti", "mono", 0.20, 91),
+        Recording("kitti_mono", "kitti_mono", "kitti", "mono", 0.20, 91, least_rate_hz=10.0),
         Recording("rgbd_desk", "rgbd_desk", "tum", "rgbd", 0.035, 160),
     )
 }
@@ -220,8 +221,10 @@ def below_bars(
             f"{recording.name}: {least:.0f} frames have a pose, {recording.least_frames} needed"
         )
     rate = 1e3 / max(run["ms_mean"] for run in ours)
-    if rate < LEAST_RATE_HZ:
-        missed.append(f"{recording.name}: {rate:.0f} frames per second, {LEAST_RATE_HZ:g} needed")
+    if rate < recording.least_rate_hz:
+        missed.append(
+            f"{recording.name}: {rate:.0f} frames per second, {recording.least_rate_hz:g} needed"
+        )
     for name in ("ms_median", "ms_p95"):
         if recording.mode == "stereo" and not ratio[name] <= LARGEST_TIME_RATIO:
             missed.append(

@@ -168,7 +168,8 @@ class Follower:
         if len(Ts) < 2:
             nothing = np.zeros(len(pixels))
             return np.full((len(pixels), 3), np.nan), nothing, nothing, nothing > 0
-        found = triangulate(Ts @ self._T_body_camera, seen_at, iterations=3)
+        # One step: the bundle adjustment takes more.
+        found = triangulate(Ts @ self._T_body_camera, seen_at, iterations=1)
         return found.points_world, found.parallax, found.errors, found.ahead
 
     def _expected(self, reference: Reference) -> Array:
