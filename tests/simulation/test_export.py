@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from odomap.errors import OutputError
+from odomap.errors import InputError, OutputError
 from odomap.simulation.export import export_euroc
 from odomap.simulation.world import World
 
@@ -39,3 +39,12 @@ def test_a_folder_that_cannot_be_written_is_named(small: World, tmp_path: Path) 
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="file"):
         export_euroc(small, tmp_path / "file")
+
+
+def test_a_fisheye_is_not_written_as_a_pinhole(tmp_path: Path) -> None:
+    world = World.make(
+        kind="room", seed=8, frames=1, resolution=(96, 64), sensors=("mono",), lens="kannala_brandt"
+    )
+    with pytest.raises(InputError, match="kannala_brandt cannot be written as EuRoC"):
+        export_euroc(world, tmp_path / "world")
+    assert not (tmp_path / "world").exists()

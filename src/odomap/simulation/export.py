@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from odomap.errors import OutputError
+from odomap.errors import InputError, OutputError
 from odomap.geometry.pose import SE3
 from odomap.sensors.frame import ImuSamples
 from odomap.sensors.rig import CameraMount, ImuMount
@@ -40,8 +40,15 @@ def export_euroc(world: World, folder: str | Path) -> Path:
         The folder.
 
     Raises:
+        InputError: a lens has no place in this format: its sensor.yaml knows radtan alone.
         OutputError: something cannot be written.
     """
+    for mount in world.rig.cameras:
+        if mount.camera.model != "pinhole":
+            raise InputError(
+                f"camera '{mount.name}': {mount.camera.model} cannot be written as EuRoC, "
+                "whose cameras are pinholes: take lens=pinhole or lens=radtan"
+            )
     root = Path(folder)
     try:
         for number, mount in enumerate(world.rig.cameras):
