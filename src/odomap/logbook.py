@@ -159,13 +159,11 @@ def skipped_numbers(source: Source) -> dict[str, Any]:
 
 def peak_memory_mb() -> float:
     """Return the most memory this process has held, megabytes; 0 where the system does not say."""
-    try:
-        # Not getrusage first: on Linux its maximum survives exec and may be that of the parent.
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024.0
-    except OSError:
-        pass  # not Linux: ask the C library below
+    # Not getrusage first: on Linux its maximum survives exec and may be that of the parent.
+    status = Path("/proc/self/status")
+    for line in status.read_text().splitlines() if status.is_file() else ():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024.0
     try:
         import resource
     except ImportError:

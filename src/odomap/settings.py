@@ -8,6 +8,7 @@ nothing here.
 """
 
 import ast
+import contextlib
 import dataclasses
 import enum
 import inspect
@@ -254,10 +255,8 @@ def _plain(value: object, hint: Any, what: str) -> object:
     if hint is float and is_number:
         return float(typing.cast(float, value))
     if hint is float and isinstance(value, str):
-        try:  # YAML 1.1 reads 1e-5, without a point, as text
+        with contextlib.suppress(ValueError):  # YAML 1.1 reads 1e-5, without a point, as text
             return float(value)
-        except ValueError:
-            pass
     if hint is int and is_number and float(typing.cast(float, value)).is_integer():
         return int(typing.cast(float, value))
     if hint in (bool, str) and isinstance(value, hint):

@@ -33,6 +33,8 @@ LARGEST_SLACK_PX = 4.0
 """A tracked point's disparity lies this near the expected one."""
 MIN_DISPARITY_PX = 0.05
 """Below this a point is at infinity as far as the pair can tell, and has no depth."""
+ANY_DEPTH = DepthConfig(nearest=1e-3, farthest=1e6)
+"""A dense disparity map is read as a depth image is, but has no range of its own."""
 
 
 class Ranger(Protocol):
@@ -111,15 +113,13 @@ class StereoRanger:
         right, config = self._right(frame), self.config
         if config.method == "sgbm":
             dense = sgbm_disparity(view.image, right, config)
-            columns, rows = np.round(keypoints).astype(np.int64).T
-            rows, columns = rows.clip(0, len(dense) - 1), columns.clip(0, dense.shape[1] - 1)
-            disparity = np.asarray(dense[rows, columns], np.float64)
-        else:
-            low = np.full(len(keypoints), -2.0)
-            high = np.full(len(keypoints), float(config.max_disparity_px))
-            near = expected * self._fb
-            low[: len(near)], high[: len(near)] = near - LARGEST_SLACK_PX, near + LARGEST_SLACK_PX
-            disparity = match_sparse(view.image, right, keypoints, config, low, high)
+            depth = self._fb / np.where(dense > MIN_DISPARITY_PX, dense, np.inf)
+            return inverse_depth_at(depth.astype(np.float32), keypoints, ANY_DEPTH)
+        low = np.full(len(keypoints), -2.0)
+        high = np.full(len(keypoints), float(config.max_disparity_px))
+        near = expected * self._fb
+        low[: len(near)], high[: len(near)] = near - LARGEST_SLACK_PX, near + LARGEST_SLACK_PX
+        disparity = match_sparse(view.image, right, keypoints, config, low, high)
         return np.where(disparity > MIN_DISPARITY_PX, disparity, np.nan) / self._fb
 
     def check(self, frame: Frame, view: View, points: Array) -> None:

@@ -128,14 +128,13 @@ class Calibration:
         Args:
             noise: of the images.
             camera: the pinhole.
-            T_body_camera: (4, 4) its mount. A camera that is the body has no direction of its own.
+            T_body_camera: (4, 4) its mount.
             inverse_depth: how far all measured inverse depths may be off together, 1/m.
         """
         rim = 0.5 * camera.width / camera.fx
-        is_body = np.array_equal(T_body_camera, np.eye(4))
         return Calibration(
             inverse_depth / np.array([1.0, rim, rim]),
-            0.0 if is_body else noise.calibration_px / camera.fx,
+            noise.calibration_px / camera.fx,
             se3_adjoint(T_body_camera),
         )
 
