@@ -20,11 +20,13 @@ from odomap.kernels import kernel
 
 __all__ = [
     "half_cot",
+    "half_cot_slope",
     "se3_compose_into",
     "se3_exp_into",
     "se3_inverse_into",
     "se3_log_into",
     "se3_retract",
+    "se3_right_jacobian_inverse_into",
     "so3_exp_into",
     "so3_left_jacobian_inverse_into",
     "so3_log_into",
@@ -62,6 +64,19 @@ def half_cot(x: float) -> float:
         return 1.0 / 12.0 + x * (1.0 / 720.0 + x * (1.0 / 30240.0 + x * d))
     half = 0.5 * np.sqrt(x)
     return float((1.0 - half * np.cos(half) / np.sin(half)) / x)
+
+
+@kernel
+def half_cot_slope(x: float) -> float:
+    """dh/dx of h = `half_cot`; the series below θ = 0.5, where the closed form cancels."""
+    if x < 0.25:
+        d = 5.0 * 691.0 / 1307674368000.0 + x * (6.0 / 74724249600.0 + x * 7.0 * 3.3896804e-13)
+        d = 3.0 / 1209600.0 + x * (4.0 / 47900160.0 + x * d)
+        return 1.0 / 720.0 + x * (2.0 / 30240.0 + x * d)
+    theta = np.sqrt(x)
+    sine = np.sin(0.5 * theta)
+    slope = 0.25 * (np.cos(0.5 * theta) / sine / theta - 0.5 / (sine * sine))
+    return float((-slope - half_cot(x)) / x)
 
 
 @kernel
@@ -168,6 +183,41 @@ def se3_log_into(R: Array, t: Array, xi: Array) -> None:
 
 
 @kernel
+def se3_right_jacobian_inverse_into(xi: Array, J: Array) -> None:
+    """J = [[A, B], [0, A]], A = I + φ^/2 + h φ^², B = ρ^/2 + h (φ^ρ^ + ρ^φ^) + 2 h' (φ·ρ) φ^².
+
+    h = `half_cot`, h' its slope: J = Σ Bₙ (-ad)ⁿ / n! with (ad² + θ²)² ad = 0.
+    """
+    p, q, r, x, y, z = xi[0], xi[1], xi[2], xi[3], xi[4], xi[5]
+    s = x * x + y * y + z * z
+    h, dot = half_cot(s), x * p + y * q + z * r
+    slope = 2.0 * half_cot_slope(s) * dot
+    J[0, 0] = 1.0 - h * (y * y + z * z)
+    J[0, 1] = h * x * y - 0.5 * z
+    J[0, 2] = h * x * z + 0.5 * y
+    J[1, 0] = h * x * y + 0.5 * z
+    J[1, 1] = 1.0 - h * (x * x + z * z)
+    J[1, 2] = h * y * z - 0.5 * x
+    J[2, 0] = h * x * z - 0.5 * y
+    J[2, 1] = h * y * z + 0.5 * x
+    J[2, 2] = 1.0 - h * (x * x + y * y)
+    # a^ b^ = b aᵀ - (a·b) I, so φ^ρ^ + ρ^φ^ = ρ φᵀ + φ ρᵀ - 2 (φ·ρ) I.
+    J[0, 3] = 2.0 * h * (p * x - dot) - slope * (y * y + z * z)
+    J[0, 4] = h * (p * y + q * x) + slope * x * y - 0.5 * r
+    J[0, 5] = h * (p * z + r * x) + slope * x * z + 0.5 * q
+    J[1, 3] = h * (p * y + q * x) + slope * x * y + 0.5 * r
+    J[1, 4] = 2.0 * h * (q * y - dot) - slope * (x * x + z * z)
+    J[1, 5] = h * (q * z + r * y) + slope * y * z - 0.5 * p
+    J[2, 3] = h * (p * z + r * x) + slope * x * z - 0.5 * q
+    J[2, 4] = h * (q * z + r * y) + slope * y * z + 0.5 * p
+    J[2, 5] = 2.0 * h * (r * z - dot) - slope * (x * x + y * y)
+    for i in range(3):
+        for j in range(3):
+            J[3 + i, j] = 0.0
+            J[3 + i, 3 + j] = J[i, j]
+
+
+@kernel
 def se3_compose_into(
     R_a: Array, t_a: Array, R_b: Array, t_b: Array, R_out: Array, t_out: Array
 ) -> None:
@@ -217,6 +267,7 @@ def warm_up() -> None:
     R_out, t_out, phi = np.empty((3, 3)), np.empty(3), np.zeros(3)
     stumpff_123(0.1)
     half_cot(0.1)
+    half_cot_slope(0.1)
     so3_exp_into(phi, R_out)
     so3_right_jacobian_into(phi, R_out)
     so3_left_jacobian_inverse_into(phi, R_out)
@@ -224,6 +275,7 @@ def warm_up() -> None:
     so3_orthonormalize_into(R, R_out)
     se3_exp_into(xi, R_out, t_out)
     se3_log_into(R, t, xi)
+    se3_right_jacobian_inverse_into(xi, np.empty((6, 6)))
     se3_compose_into(R, t, R, t, R_out, t_out)
     se3_inverse_into(R, t, R_out, t_out)
     se3_retract(R, t, xi, R_out, t_out)

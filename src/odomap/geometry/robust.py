@@ -10,9 +10,11 @@ with weights w(s) = ρ'(s), recomputed at each step. With a constant c (in σ), 
     geman_mcclure  s / (1 + s/c²)          1 / (1 + s/c²)²
     tukey          c²/3 (1 - (1 - s/c²)³)  (1 - s/c²)²; 0 beyond c
     truncated      min(s, c²)              1; 0 beyond c
+    dcs            s; c² (3s - c²)/(s + c²)  1; (2c² / (c² + s))²
 
 The first three keep a pull from every residual, the others let go of gross ones. The default
-constants lose 5 % efficiency on Gaussian noise in one dimension (truncated: three σ).
+constants lose 5 % efficiency on Gaussian noise in one dimension (truncated: three σ). The last is
+dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard, ICRA 2013), Φ = c².
 
 Reference: Z. Zhang, "Parameter estimation techniques: a tutorial with application to conic
 fitting", Image and Vision Computing 15(1), 1997.
@@ -33,6 +35,8 @@ __all__ = [
     "Loss",
     "cauchy_cost",
     "cauchy_weight",
+    "dcs_cost",
+    "dcs_weight",
     "geman_mcclure_cost",
     "geman_mcclure_weight",
     "huber_cost",
@@ -109,6 +113,18 @@ def tukey_weight(r2: ArrayLike, c: float = 4.685) -> Array:
     return np.asarray(rest * rest)
 
 
+def dcs_cost(r2: ArrayLike, c: float = 1.0) -> Array:
+    """Return s up to c², then c² (3s - c²) / (s + c²), below 3c²; arguments as `huber_cost`."""
+    s = np.asarray(r2, dtype=np.float64)
+    return np.where(s <= c * c, s, c * c * (3.0 * s - c * c) / (s + c * c))
+
+
+def dcs_weight(r2: ArrayLike, c: float = 1.0) -> Array:
+    """Return 1 up to c², then (2c² / (c² + s))²; arguments as `huber_cost`."""
+    s = np.asarray(r2, dtype=np.float64)
+    return np.asarray(np.minimum(1.0, 2.0 * c * c / (c * c + s)) ** 2)
+
+
 def truncated_cost(r2: ArrayLike, c: float = 3.0) -> Array:
     """Return min(s, c²); arguments as `huber_cost`."""
     return np.minimum(np.asarray(r2, dtype=np.float64), c * c)
@@ -129,6 +145,7 @@ LOSSES: Mapping[str, tuple[_Rule, _Rule, float]] = MappingProxyType(
         "geman_mcclure": (geman_mcclure_cost, geman_mcclure_weight, 3.787),
         "tukey": (tukey_cost, tukey_weight, 4.685),
         "truncated": (truncated_cost, truncated_weight, 3.0),
+        "dcs": (dcs_cost, dcs_weight, 1.0),
     }
 )
 """Cost, weight and default constant of each loss by name."""
