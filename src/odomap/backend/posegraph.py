@@ -15,6 +15,7 @@ Reference: G. Grisetti, R. Kümmerle, C. Stachniss, W. Burgard, "A tutorial on g
 IEEE Intelligent Transportation Systems Magazine 2(4), 2010.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -201,12 +202,13 @@ class PoseGraph:
         """(N, d) positions of the nodes in the world, metres."""
         return self.Ts_world_node[:, : self.space, self.space]
 
-    def placed(self, Ts_world_node: ArrayLike, points_world: ArrayLike | None = None) -> Self:
-        """Return the same graph at other poses (N, m, m) and landmarks (M, d)."""
-        points = self.points
+    def placed(self, Ts_world_node: Array, points_world: Array | None = None) -> Self:
+        """Return the same graph at other poses (N, m, m) and landmarks (M, d), unchecked."""
+        other = copy.copy(self)
+        other._set("Ts_world_node", Ts_world_node)
         if points_world is not None:
-            points = replace(points, points_world=np.asarray(points_world, np.float64))
-        return replace(self, Ts_world_node=np.asarray(Ts_world_node, np.float64), points=points)
+            other._set("points", replace(self.points, points_world=points_world))
+        return other
 
     def without(self, edges: NDArray[np.bool_]) -> Self:
         """Return the graph without the edges marked (E,)."""
