@@ -141,10 +141,12 @@ class Parts:
         if len(same):
             name = names[order[same[0]]]
             before, line = sorted(lines[order[same[0] : same[0] + 2]])
-            if not line:
-                raise InputError(f"{self.file}: {name} is named as a pose and as a landmark")
-            also = f", first in line {before}" if before else " as a pose"
-            raise InputError(f"{self.file}:{line}: vertex {name} is there twice{also}: remove one")
+            if before:
+                what = f"vertex {name} is there twice, first in line {before}: remove one"
+            else:
+                line = self.sights.lines[np.argmax(self.sights.ids[:, 1] == name)]
+                what = f"vertex {name} is a pose and a landmark at once"
+            raise InputError(f"{self.file}:{line}: {what}")
 
     def _find(self, vertices: Rows, rows: Rows, column: int) -> Index:
         """Return the places of named vertices."""
@@ -157,8 +159,9 @@ class Parts:
         missing = vertices.ids[found, 0] != names
         if missing.any():
             row = int(np.argmax(missing))
+            what = "landmark" if rows is self.sights and column == 1 else "pose"
             raise InputError(
-                f"{self.file}:{rows.lines[row]}: vertex {names[row]} is declared nowhere: "
+                f"{self.file}:{rows.lines[row]}: {what} {names[row]} is declared nowhere: "
                 "is its VERTEX line missing?"
             )
         return np.asarray(found, np.int64)
