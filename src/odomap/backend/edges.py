@@ -16,6 +16,7 @@ Reference: J. Solà, J. Deray, D. Atchuthan, "A micro Lie theory for state estim
 arXiv:1812.01537, 2018; chordal: D. M. Rosen et al., "SE-Sync", IJRR 38(2-3), 2019.
 """
 
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -25,10 +26,15 @@ from odomap.geometry.lie_kernels import half_cot, se3_log_into, se3_right_jacobi
 from odomap.geometry.robust_kernels import loss_cost, loss_weight
 from odomap.kernels import kernel
 
-__all__ = ["EdgeArrays", "TargetArrays", "cost_of_edges", "linearise_edges", "warm_up"]
+__all__ = ["TANGENT", "EdgeArrays", "TargetArrays", "cost_of_edges", "linearise_edges", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Size = tuple[int, ...]
+
+TANGENT = MappingProxyType({"SE2": (0, 0, 0), "SE3": (0,) * 6, "Sim3": (0,) * 7})
+"""As many zeros as a pose has unknowns: kernels know the length of a tuple when they are compiled,
+and their loops over it are unrolled."""
 
 
 class EdgeArrays(NamedTuple):
@@ -66,9 +72,11 @@ class TargetArrays(NamedTuple):
 
 
 @kernel(reorder=True)
-def relative_motion(T_i: Array, T_j: Array, Z_inverse: Array, D: Array, E: Array) -> None:
+def relative_motion(
+    tangent: Size, T_i: Array, T_j: Array, Z_inverse: Array, D: Array, E: Array
+) -> None:
     """D = T_i⁻¹ T_j and E = Z⁻¹ D, rigid motions of the plane (3, 3) or of space (4, 4)."""
-    d = len(T_i) - 1
+    d = 2 if len(tangent) == 3 else 3
     for a in range(d):
         for b in range(d + 1):
             total = 0.0
@@ -85,9 +93,9 @@ def relative_motion(T_i: Array, T_j: Array, Z_inverse: Array, D: Array, E: Array
 
 
 @kernel(reorder=True)
-def adjoint_of_inverse(D: Array, M: Array) -> None:
+def adjoint_of_inverse(tangent: Size, D: Array, M: Array) -> None:
     """M = Ad(D⁻¹): [[Rᵀ, -Rᵀ t^], [0, Rᵀ]], or in the plane [[Rᵀ, -Rᵀ (t_y, -t_x)], [0, 1]]."""
-    if len(D) == 3:
+    if len(tangent) == 3:
         for a in range(2):
             M[a, 0], M[a, 1] = D[0, a], D[1, a]
             M[a, 2] = -D[0, a] * D[1, 2] + D[1, a] * D[0, 2]
@@ -126,9 +134,9 @@ def _inverse_right_jacobian_in_the_plane(r: Array, J: Array) -> None:
 
 
 @kernel
-def log_of_error(E: Array, R: Array, t: Array, r: Array) -> None:
+def log_of_error(tangent: Size, E: Array, R: Array, t: Array, r: Array) -> None:
     """r = log E; R and t are room for the parts of E."""
-    if len(E) == 3:
+    if len(tangent) == 3:
         _log_in_the_plane(E, r)
         return
     for a in range(3):
@@ -139,12 +147,14 @@ def log_of_error(E: Array, R: Array, t: Array, r: Array) -> None:
 
 
 @kernel(reorder=True)
-def _geodesic(r: Array, information: Array, J: Array, WJ: Array, A: Array, b: Array) -> float:
+def _geodesic(
+    tangent: Size, r: Array, information: Array, J: Array, WJ: Array, A: Array, b: Array
+) -> float:
     """A = Jᵀ Ω J, b = Jᵀ Ω r; return rᵀ Ω r."""
-    k, chi2 = len(r), 0.0
+    k, chi2 = len(tangent), 0.0
     if k == 3:
         _inverse_right_jacobian_in_the_plane(r, J)
-    elif k == 6:
+    else:
         se3_right_jacobian_inverse_into(r, J)
     for p in range(k):
         total = 0.0
@@ -174,9 +184,10 @@ def _geodesic(r: Array, information: Array, J: Array, WJ: Array, A: Array, b: Ar
 
 
 @kernel(reorder=True)
-def _chordal(E: Array, kappa: float, tau: float, A: Array, b: Array) -> float:
+def _chordal(tangent: Size, E: Array, kappa: float, tau: float, A: Array, b: Array) -> float:
     """Twice Gauss-Newton's A and b of f = κ |E_R - I|² + τ |E_t|²; return 2 f."""
-    d, k, f = len(E) - 1, len(b), 0.0
+    k, f = len(tangent), 0.0
+    d = 2 if k == 3 else 3
     for p in range(k):
         for q in range(k):
             A[p, q] = 0.0
@@ -201,10 +212,19 @@ def _chordal(E: Array, kappa: float, tau: float, A: Array, b: Array) -> float:
 
 @kernel(reorder=True)
 def scatter(
-    e: int, i: int, j: int, w: float, A: Array, b: Array, M: Array, MA: Array, into: TargetArrays
+    tangent: Size,
+    e: int,
+    i: int,
+    j: int,
+    w: float,
+    A: Array,
+    b: Array,
+    M: Array,
+    MA: Array,
+    into: TargetArrays,
 ) -> None:
     """Add w times an edge's A, b to H and g at its nodes; MA is room for Mᵀ A."""
-    k, values, gradient = len(b), into.values, into.gradient
+    k, values, gradient = len(tangent), into.values, into.gradient
     if into.column[j] >= 0:
         row, at = into.row[j], into.diagonal[j]
         for p in range(k):
@@ -243,6 +263,7 @@ def scatter(
 
 @kernel
 def linearise_edges(
+    tangent: Size,
     Ts: Array,
     edges: EdgeArrays,
     is_chordal: bool,
@@ -252,20 +273,21 @@ def linearise_edges(
     chi2: Array,
 ) -> float:
     """Add all edges to H and g at poses Ts (N, m, m); return the cost, write r² of each edge."""
-    m, k = Ts.shape[1], 3 if Ts.shape[1] == 3 else 6
+    k = len(tangent)
+    m = 3 if k == 3 else 4
     D, E, R, t = np.eye(m), np.eye(m), np.empty((3, 3)), np.empty(3)
     r, b, J, WJ = np.empty(k), np.empty(k), np.empty((k, k)), np.empty((k, k))
     A, M, MA = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
     cost = 0.0
     for e in range(len(edges.first)):
         i, j = edges.first[e], edges.second[e]
-        relative_motion(Ts[i], Ts[j], edges.Ts_inverse[e], D, E)
+        relative_motion(tangent, Ts[i], Ts[j], edges.Ts_inverse[e], D, E)
         if is_chordal:
             kappa, tau = edges.information[e, 0, 0], edges.information[e, 0, 1]
-            s = _chordal(E, kappa, tau, A, b)
+            s = _chordal(tangent, E, kappa, tau, A, b)
         else:
-            log_of_error(E, R, t, r)
-            s = _geodesic(r, edges.information[e], J, WJ, A, b)
+            log_of_error(tangent, E, R, t, r)
+            s = _geodesic(tangent, r, edges.information[e], J, WJ, A, b)
         chi2[e] = s
         w = edges.weight[e]
         if edges.is_robust[e]:
@@ -274,21 +296,28 @@ def linearise_edges(
         else:
             cost += 0.5 * w * s
         if w > 0.0:
-            adjoint_of_inverse(D, M)
-            scatter(e, i, j, w, A, b, M, MA, into)
+            adjoint_of_inverse(tangent, D, M)
+            scatter(tangent, e, i, j, w, A, b, M, MA, into)
     return cost
 
 
 @kernel
 def cost_of_edges(
-    Ts: Array, edges: EdgeArrays, is_chordal: bool, loss: int, width: float, chi2: Array
+    tangent: Size,
+    Ts: Array,
+    edges: EdgeArrays,
+    is_chordal: bool,
+    loss: int,
+    width: float,
+    chi2: Array,
 ) -> float:
     """Return the cost of all edges at poses Ts (N, m, m), and write r² of each."""
-    m, k = Ts.shape[1], 3 if Ts.shape[1] == 3 else 6
+    k = len(tangent)
+    m = 3 if k == 3 else 4
     D, E, R, t, r = np.eye(m), np.eye(m), np.empty((3, 3)), np.empty(3), np.empty(k)
     cost = 0.0
     for e in range(len(edges.first)):
-        relative_motion(Ts[edges.first[e]], Ts[edges.second[e]], edges.Ts_inverse[e], D, E)
+        relative_motion(tangent, Ts[edges.first[e]], Ts[edges.second[e]], edges.Ts_inverse[e], D, E)
         s = 0.0
         if is_chordal:
             rotation = 0.0
@@ -299,7 +328,7 @@ def cost_of_edges(
                     rotation += off * off
             s = 2.0 * (edges.information[e, 0, 0] * rotation + edges.information[e, 0, 1] * s)
         else:
-            log_of_error(E, R, t, r)
+            log_of_error(tangent, E, R, t, r)
             for p in range(k):
                 for q in range(k):
                     s += r[p] * edges.information[e, p, q] * r[q]
@@ -312,7 +341,9 @@ def cost_of_edges(
 def warm_up() -> None:
     """Compile the kernels of this module."""
     first, second = np.array([0]), np.array([1])
-    for m, k in ((3, 3), (4, 6)):
+    for tangent in (TANGENT["SE2"], TANGENT["SE3"]):
+        k = len(tangent)
+        m = 3 if k == 3 else 4
         Ts = np.tile(np.eye(m), (2, 1, 1))
         for is_chordal in (False, True):
             information = np.ones((1, 1, 2)) if is_chordal else np.eye(k)[None]
@@ -327,5 +358,5 @@ def warm_up() -> None:
                 np.zeros(k * k),
                 np.zeros(k),
             )
-            linearise_edges(Ts, edges, is_chordal, 0, 1.0, into, np.empty(1))
-            cost_of_edges(Ts, edges, is_chordal, 0, 1.0, np.empty(1))
+            linearise_edges(tangent, Ts, edges, is_chordal, 0, 1.0, into, np.empty(1))
+            cost_of_edges(tangent, Ts, edges, is_chordal, 0, 1.0, np.empty(1))

@@ -18,7 +18,7 @@ from odomap.backend.blockcholesky import BlockCholesky
 from odomap.backend.blocks import BlockPattern
 from odomap.backend.chordal import isotropic_weights
 from odomap.backend.descent import Linear
-from odomap.backend.edges import EdgeArrays, TargetArrays, cost_of_edges, linearise_edges
+from odomap.backend.edges import TANGENT, EdgeArrays, TargetArrays, cost_of_edges, linearise_edges
 from odomap.backend.posegraph import PoseGraph
 from odomap.backend.sights import SightArrays, SightTargets, linearise_sights
 from odomap.backend.similarities import cost_of_similarities, linearise_similarities
@@ -64,6 +64,7 @@ class GraphProblem:
         weights: Array,
     ) -> None:
         self.graph, self.is_chordal, self.loss = graph, is_chordal, loss_code(loss)
+        self.tangent = TANGENT[graph.group]
         self.edges = _edge_arrays(graph, is_chordal, is_robust, weights)
         points = graph.points
         self.sights = SightArrays(points.node, points.point, points.points_node, points.information)
@@ -113,7 +114,7 @@ class GraphProblem:
             out.cost = linearise_similarities(x.Ts, self.edges, *self.loss, into, self.chi2)
         else:
             out.cost = linearise_edges(
-                x.Ts, self.edges, self.is_chordal, *self.loss, into, self.chi2
+                self.tangent, x.Ts, self.edges, self.is_chordal, *self.loss, into, self.chi2
             )
         if len(self.sights.node):
             out.cost += self._linearise_sights(x, out)
@@ -138,7 +139,9 @@ class GraphProblem:
         """Return the cost of edges and priors at x; sights are left out."""
         if self.graph.group == "Sim3":
             return cost_of_similarities(x.Ts, self.edges, *self.loss, self.chi2)
-        return float(cost_of_edges(x.Ts, self.edges, self.is_chordal, *self.loss, self.chi2))
+        return float(
+            cost_of_edges(self.tangent, x.Ts, self.edges, self.is_chordal, *self.loss, self.chi2)
+        )
 
     def state(self, Ts_world_node: Array, points_world: Array) -> GraphState:
         """Return poses (N, m, m) and landmarks (M, d) as a state."""

@@ -77,13 +77,13 @@ def _accumulate(
     chi2: Array,
 ) -> float:
     """Scatter A (E, k, k) and b (E, k) of each edge, weighed by its loss; return the cost."""
-    MA = np.empty(A.shape[1:])
+    MA, tangent = np.empty(A.shape[1:]), (0, 0, 0, 0, 0, 0, 0)
     for e in range(len(chi2)):
         w = edges.weight[e]
         if edges.is_robust[e]:
             w *= loss_weight(loss, width, chi2[e])
         if w > 0.0:
-            scatter(e, edges.first[e], edges.second[e], w, A[e], b[e], M[e], MA, into)
+            scatter(tangent, e, edges.first[e], edges.second[e], w, A[e], b[e], M[e], MA, into)
     return float(_weigh(edges, loss, width, chi2))
 
 
