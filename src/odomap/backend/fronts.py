@@ -74,7 +74,7 @@ def eliminate(
 
 @kernel(reorder=True)
 def _finish_rows(factor: Array, start: int, p: int, end: int, f: int, diagonal: Array) -> int:
-    """u_i = (a_i − Σ_{p ≤ q < i} u_qi u_q) / √pivot for the rows p ≤ i < end; a failed row or −1."""
+    """u_i = (a_i − Σ_{p ≤ q < i} u_qi u_q) / √pivot for rows p ≤ i < end; a failed row or −1."""
     for i in range(p, end):
         row, width = start + i * f + i, f - i
         for q in range(p, i):

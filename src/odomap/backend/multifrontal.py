@@ -22,8 +22,8 @@ ACM TOMS 9(3), 1983; Liu, "The Multifrontal Method for Sparse Matrix Solution", 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.fronts import SLACK_ROWS, TILE, eliminate
 from odomap.backend.blocks import BlockPattern
+from odomap.backend.fronts import SLACK_ROWS, TILE, eliminate
 from odomap.backend.symbolic import Fronts, analyse
 from odomap.kernels import kernel
 
@@ -87,7 +87,7 @@ def factor_fronts(
             _extend_add(runs, stack, end, size, factor, start, k, f, rest)
         failed = eliminate(factor, start, k, f, stack, rest, diagonal, tile)
         if failed >= 0:
-            return fronts.pivot[s] + failed
+            return int(fronts.pivot[s] + failed)
         for r in range(m):  # down to where the children's were, and packed
             for c in range(m - r):
                 stack[U(end + c)] = stack[U(rest + r * (m + 1) + c)]
@@ -99,7 +99,7 @@ def factor_fronts(
 
 @kernel
 def _add_block(entry: Index, values: Array, factor: Array, f: int) -> None:
-    """Copy one block of A into its front, upper half of a diagonal one, transposed if it says so."""
+    """Copy one block of A into its front, transposed if its rows are eliminated later."""
     source, rows, columns, place, is_transposed = entry[0], entry[1], entry[2], entry[3], entry[4]
     if is_transposed == 1:
         for a in range(rows):
@@ -127,11 +127,11 @@ def _extend_add(
 ) -> None:
     """Add a child's packed update (m rows, at `source`) to its parent's front."""
     for a in range(len(runs)):
-        for x in range(runs[a, 1]):
-            row, done = runs[a, 2] + x, runs[a, 0] + x
+        for x in range(runs[a, 0]):
+            row = runs[a, 1] + x
             for b in range(a, len(runs)):
                 skip = x if b == a else 0
-                column, count = runs[b, 2] + skip, runs[b, 1] - skip
+                column, count = runs[b, 1] + skip, runs[b, 0] - skip
                 if row < k:
                     to = start + row * f + column
                     for j in range(count):

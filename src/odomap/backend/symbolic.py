@@ -52,11 +52,11 @@ class Fronts(NamedTuple):
         border: (S + 1,) where in `border_rows` its border begins.
         border_rows: (B,) positions of the border's scalar rows, ascending.
         run: (S + 1,) where in `runs` its runs begin.
-        runs: (R, 3) runs of the border that stay together in the parent's front: first row in the
-            border, length, first row in the parent's front.
+        runs: (R, 2) runs of the border that stay together in the parent's front: their length, and
+            their first row there.
         entry: (S + 1,) where in `entries` its blocks of A begin.
         entries: (N + P, 5): place in `values`, rows and columns there, place in the factor, and
-            whether it is written transposed; of a diagonal block the upper half is written.
+            whether it is written transposed.
     """
 
     order: Index
@@ -342,7 +342,7 @@ def _runs(parent: Index, pivot: Index, border: Index, border_rows: Index) -> tup
     """Find the runs of each front's border that are neighbours in its parent's front as well."""
     run, runs, count = (
         np.zeros(len(parent) + 1, np.int64),
-        np.empty((len(border_rows), 3), np.int64),
+        np.empty((len(border_rows), 2), np.int64),
         0,
     )
     for s in range(len(parent)):
@@ -357,9 +357,9 @@ def _runs(parent: Index, pivot: Index, border: Index, border_rows: Index) -> tup
                     q += 1
                 place = pivot[above + 1] - pivot[above] + q - border[above]
             if place != previous + 1:
-                runs[count, 0], runs[count, 1], runs[count, 2] = p - border[s], 0, place
+                runs[count, 0], runs[count, 1] = 0, place
                 count += 1
-            runs[count - 1, 1] += 1
+            runs[count - 1, 0] += 1
             previous = place
         run[s + 1] = count
     return run, runs[:count].copy()
