@@ -89,7 +89,7 @@ def _harmonic_mean(A: Array, at: int, space: int) -> float:
         minors = a * b - c * c + a * f - d * d + b * f - e * e
     if not (determinant > 0.0 and minors > 0.0):
         return 0.0
-    return space * determinant / minors
+    return float(space * determinant / minors)
 
 
 @kernel
