@@ -10,8 +10,8 @@ methods solve that model, try the step and look at the gain it brought over the 
 
 Hats are the variables scaled by √diag H, so that metres and radians compare. The radius begins
 unbounded: from a good start the dogleg is Gauss-Newton. A descent ends when the next step promises
-a smaller fraction of the cost than the tolerance, and otherwise says honestly why it stopped; x is
-never worse than the start, nor anything but finite.
+a smaller fraction of the cost than the tolerance, or hardly moves; otherwise it says honestly why
+it stopped. The point returned is never worse than the start, nor anything but finite.
 
 Reference: K. Madsen, H. B. Nielsen, O. Tingleff, "Methods for non-linear least squares problems",
 2nd ed., DTU, 2004.
@@ -49,6 +49,8 @@ class SolverConfig:
     """Most steps tried."""
     tolerance: NotNegative = 1e-9
     """Stop when a step promises a smaller fraction of the cost."""
+    step_tolerance: NotNegative = 1e-10
+    """Stop when no unknown would move by more, metres or radians."""
     damping: Positive = 1e-4
     """First λ of Levenberg-Marquardt."""
 
@@ -175,7 +177,8 @@ def descend(
         if proposal is None:
             reason = "the equations are singular: something is not determined by what was measured"
             break
-        if proposal.possible <= config.tolerance * now.cost:
+        size = float(np.abs(proposal.step).max(initial=0.0))
+        if proposal.possible <= config.tolerance * now.cost or size <= config.step_tolerance:
             reason, converged = "converged", True
             break
         moved = problem.retract(x, proposal.step)
@@ -184,7 +187,7 @@ def descend(
         if region.accepts(gained, proposal.promised):
             x, now, spare = moved, spare, now
             best, lowest = (x, now.cost) if now.cost <= lowest else (best, lowest)
-        record(lowest, float(np.abs(proposal.step).max(initial=0.0)))
+        record(lowest, size)
         if region.is_hopeless():
             reason = "no step lowers the cost"
             break
