@@ -20,6 +20,10 @@ from typing import TYPE_CHECKING
 from odomap.version import __version__
 
 if TYPE_CHECKING:
+    from odomap.backend.certificate import certify
+    from odomap.backend.descent import SolverConfig
+    from odomap.backend.posegraph import PoseGraph, Priors, Sights
+    from odomap.backend.solve import Solution, solve
     from odomap.calibrate import calibrate
     from odomap.errors import (
         CalibrationError,
@@ -32,12 +36,15 @@ if TYPE_CHECKING:
     )
     from odomap.evaluation.metrics import ate, rpe
     from odomap.export import export
+    from odomap.files.bal import read_bal, write_bal
     from odomap.files.calibrations import read_calibration
     from odomap.files.clouds import read_ply, write_ply
+    from odomap.files.g2o import read_g2o, write_g2o
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
     from odomap.geometry.camera import Camera
     from odomap.geometry.pose import SE2, SE3, SO3, Sim3
+    from odomap.geometry.robust import Loss
     from odomap.geometry.trajectory import Trajectory
     from odomap.maps.estimate import Estimate, Status
     from odomap.maps.map import Map
@@ -61,15 +68,21 @@ __all__ = [
     "Estimate",
     "Frame",
     "InputError",
+    "Loss",
     "Map",
     "MissingExtra",
     "MonocularVO",
     "OdomapError",
     "OutputError",
+    "PoseGraph",
+    "Priors",
     "Result",
     "RgbdVO",
     "Rig",
+    "Sights",
     "Sim3",
+    "Solution",
+    "SolverConfig",
     "Source",
     "Status",
     "StereoVO",
@@ -79,15 +92,21 @@ __all__ = [
     "__version__",
     "ate",
     "calibrate",
+    "certify",
     "export",
     "open",
     "preset",
+    "read_bal",
     "read_calibration",
+    "read_g2o",
     "read_ply",
     "read_rig",
     "read_tum",
     "rpe",
     "run",
+    "solve",
+    "write_bal",
+    "write_g2o",
     "write_ply",
     "write_rig",
     "write_tum",
@@ -101,18 +120,24 @@ _HOMES = {
     "Estimate": "maps.estimate",
     "Frame": "sensors.frame",
     "InputError": "errors",
+    "Loss": "geometry.robust",
     "Map": "maps.map",
     "MissingExtra": "errors",
     "MonocularVO": "system.odometry",
     "OdomapError": "errors",
     "OutputError": "errors",
+    "PoseGraph": "backend.posegraph",
+    "Priors": "backend.posegraph",
     "Result": "system.odometry",
     "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
     "SE2": "geometry.pose",
     "SE3": "geometry.pose",
     "SO3": "geometry.pose",
+    "Sights": "backend.posegraph",
     "Sim3": "geometry.pose",
+    "Solution": "backend.solve",
+    "SolverConfig": "backend.descent",
     "Source": "sources.source",
     "Status": "maps.estimate",
     "StereoVO": "system.odometry",
@@ -121,15 +146,21 @@ _HOMES = {
     "World": "simulation.world",
     "ate": "evaluation.metrics",
     "calibrate": "calibrate",
+    "certify": "backend.certificate",
     "export": "export",
     "open": "sources.open",
     "preset": "system.config",
+    "read_bal": "files.bal",
     "read_calibration": "files.calibrations",
+    "read_g2o": "files.g2o",
     "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
     "rpe": "evaluation.metrics",
     "run": "run",
+    "solve": "backend.solve",
+    "write_bal": "files.bal",
+    "write_g2o": "files.g2o",
     "write_ply": "files.clouds",
     "write_rig": "files.rig",
     "write_tum": "files.trajectories",

@@ -178,7 +178,8 @@ def descend(
             reason = "the equations are singular: something is not determined by what was measured"
             break
         size = float(np.abs(proposal.step).max(initial=0.0))
-        if proposal.possible <= config.tolerance * now.cost or size <= config.step_tolerance:
+        is_still = size <= config.step_tolerance and proposal.promised >= proposal.possible
+        if is_still or proposal.possible <= config.tolerance * now.cost:
             reason, converged = "converged", True
             break
         moved = problem.retract(x, proposal.step)
