@@ -18,6 +18,7 @@ from odomap.cli.doctor import Doctor
 from odomap.cli.evaluate import Evaluate
 from odomap.cli.export import Export
 from odomap.cli.info import Info
+from odomap.cli.optimize import Optimize
 from odomap.cli.run import Run
 from odomap.errors import InputError, nearest_name
 from odomap.version import __version__
@@ -29,6 +30,7 @@ VERBS: dict[str, Any] = {
     "demo": Demo,
     "calibrate": Calibrate,
     "eval": Evaluate,
+    "optimize": Optimize,
     "export": Export,
     "info": Info,
     "config": ConfigVerb,

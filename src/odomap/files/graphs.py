@@ -12,9 +12,9 @@ from odomap.backend.posegraph import PoseGraph
 from odomap.files.g2o import G2O, parts_of_g2o, write_g2o
 from odomap.files.graphlines import parse_lines
 from odomap.files.text import read_text
-from odomap.files.toro import TORO, parts_of_toro, write_toro
+from odomap.files.toro import TORO, check_toro, parts_of_toro, write_toro
 
-__all__ = ["GraphFile", "read_graph", "read_graph_file", "write_graph"]
+__all__ = ["GraphFile", "check_graph_file", "read_graph", "read_graph_file", "write_graph"]
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,18 @@ def write_graph(path: str | Path, graph: PoseGraph) -> None:
         OutputError: it cannot be written.
     """
     file = Path(path)
+    (write_toro if _is_toro_name(file) else write_g2o)(file, graph)
+
+
+def check_graph_file(path: str | Path, graph: PoseGraph) -> None:
+    """Raise if a file of that name cannot hold a graph, before it is solved."""
+    if _is_toro_name(Path(path)):
+        check_toro(Path(path), graph)
+
+
+def _is_toro_name(file: Path) -> bool:
     suffix = Path(file.stem).suffix if file.suffix == ".gz" else file.suffix
-    write = write_toro if suffix.lower() in (".toro", ".graph") else write_g2o
-    write(file, graph)
+    return suffix.lower() in (".toro", ".graph")
 
 
 def _is_toro(text: str) -> bool:

@@ -28,7 +28,7 @@ from odomap.files.graphposes import euler_from_rotation, rotation_from_euler
 from odomap.files.text import read_text
 from odomap.geometry.lie import quaternion_from_rotation, rotation_from_quaternion
 
-__all__ = ["TORO", "parts_of_toro", "read_toro", "write_toro"]
+__all__ = ["TORO", "check_toro", "parts_of_toro", "read_toro", "write_toro"]
 
 TORO: Mapping[str, Layout] = MappingProxyType(
     {
@@ -73,6 +73,19 @@ def write_toro(path: str | Path, graph: PoseGraph) -> None:
         OutputError: it cannot be written.
     """
     file = Path(path)
+    check_toro(file, graph)
+    parts = Parts.of(file, graph)
+    if graph.group == "SE2":
+        inverse = [*range(3), *(3 + np.argsort(ORDER_2D))]
+        edges = replace(parts.edges, numbers=parts.edges.numbers[:, inverse])
+        write_rows(file, [("VERTEX2", parts.nodes), ("EDGE2", edges)])
+    else:
+        blocks = [("VERTEX3", parts.nodes), ("EDGE3", parts.edges)]
+        write_rows(file, [(tag, _with_euler(rows)) for tag, rows in blocks])
+
+
+def check_toro(file: Path, graph: PoseGraph) -> None:
+    """Raise if a graph holds what a TORO file cannot say."""
     extra = {
         "nodes that are held": bool(graph.is_fixed.any()),
         "priors": bool(len(graph.priors.node)),
@@ -82,14 +95,6 @@ def write_toro(path: str | Path, graph: PoseGraph) -> None:
     for what, there in extra.items():
         if there:
             raise InputError(f"{file}: TORO files have no {what}: write a .g2o file")
-    parts = Parts.of(file, graph)
-    if graph.group == "SE2":
-        inverse = [*range(3), *(3 + np.argsort(ORDER_2D))]
-        edges = replace(parts.edges, numbers=parts.edges.numbers[:, inverse])
-        write_rows(file, [("VERTEX2", parts.nodes), ("EDGE2", edges)])
-    else:
-        blocks = [("VERTEX3", parts.nodes), ("EDGE3", parts.edges)]
-        write_rows(file, [(tag, _with_euler(rows)) for tag, rows in blocks])
 
 
 def parts_of_toro(lines: Lines) -> Parts:
