@@ -125,12 +125,12 @@ class BlockCholesky:
             solve_fronts(self.fronts, self.values, y, np.empty(self._widest))
             x[rows] = y
             return x
-        local = np.empty(self._widest * GROUP)
+        local, visited = np.empty(self._widest * GROUP), np.arange(len(self.fronts.parent))
         for start in range(0, b.shape[1], GROUP):
             count = min(GROUP, b.shape[1] - start)
             group = np.zeros((len(b), GROUP))
             group[:, :count] = b[rows, start : start + count]
-            solve_group(self.fronts, self.values, group.reshape(-1), local)
+            solve_group(self.fronts, self.values, visited, group.reshape(-1), local)
             x[rows, start : start + count] = group[:, :count]
         return x
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["SLACK_ROWS", "TILE", "eliminate", "warm_up"]
+__all__ = ["SLACK_ROWS", "TILE", "eliminate", "take_off", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -64,11 +64,11 @@ def eliminate(
             for r in range(end, min(k, c + width), 4):
                 skip = max(r - c, 0)
                 row = start + r * f + c + skip
-                _take_off(factor, row, f, tile, skip, factor, x + r, f, width - skip)
+                take_off(factor, row, f, tile, skip, factor, x + r, f, width - skip)
             for r in range(k, c + width, 4):
                 skip = max(r - c, 0)
                 row = rest + (r - k) * m + c + skip - k
-                _take_off(stack, row, m, tile, skip, factor, x + r, f, width - skip)
+                take_off(stack, row, m, tile, skip, factor, x + r, f, width - skip)
     return -1
 
 
@@ -92,7 +92,7 @@ def _finish_rows(factor: Array, start: int, p: int, end: int, f: int, diagonal: 
 
 
 @kernel(reorder=True)
-def _take_off(
+def take_off(
     F: Array, row: int, g: int, tile: Array, t: int, P: Array, x: int, f: int, width: int
 ) -> None:
     """F[r, j] −= Σ_{q < 4} P[q, r] tile[q, j] for four rows r; rows of F are g apart, of P f."""

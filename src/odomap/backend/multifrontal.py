@@ -175,11 +175,14 @@ def solve_fronts(fronts: Fronts, factor: Array, x: Array, local: Array) -> None:
 
 
 @kernel(reorder=True)
-def solve_group(fronts: Fronts, factor: Array, x: Array, local: Array) -> None:
-    """Do as `solve_fronts` with GROUP right-hand sides, x (n GROUP,) row-major."""
-    count = len(fronts.parent)
+def solve_group(fronts: Fronts, factor: Array, visited: Index, x: Array, local: Array) -> None:
+    """Do as `solve_fronts` with GROUP right-hand sides, x (n GROUP,) row-major.
+
+    `visited` names the fronts that take part, ascending, and with each its parent. From right-hand
+    sides that are zero in all others follow solutions that are right in these.
+    """
     y = np.empty(GROUP)
-    for s in range(count):
+    for s in visited:
         k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
         border = fronts.border[s] - k
         for j in range(f * GROUP):
@@ -198,7 +201,7 @@ def solve_group(fronts: Fronts, factor: Array, x: Array, local: Array) -> None:
             at = fronts.border_rows[border + j] * GROUP
             for g in range(GROUP):
                 x[at + g] -= local[j * GROUP + g]
-    for s in range(count - 1, -1, -1):
+    for s in visited[::-1]:
         k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
         border = fronts.border[s] - k
         for j in range(k, f):
@@ -227,5 +230,5 @@ def warm_up() -> None:
         fronts, np.array([2.0, 2.0, 1.0]), 0.0, factor, np.zeros(64), np.zeros(4 * TILE + 8)
     )
     solve_fronts(fronts, factor, x[:2], np.zeros(2))
-    solve_group(fronts, factor, x, np.zeros(2 * GROUP))
+    solve_group(fronts, factor, np.arange(len(fronts.parent)), x, np.zeros(2 * GROUP))
     stack_size(fronts)

@@ -32,7 +32,7 @@ __all__ = ["Fronts", "analyse", "warm_up"]
 Index = NDArray[np.int64]
 
 # The model of a front's time in nanoseconds: per front, per entry, per pivot and entry.
-FRONT_NS, ENTRY_NS, UPDATE_NS = 600.0, 0.7, 0.08
+FRONT_NS, ENTRY_NS, UPDATE_NS = 300.0, 0.35, 0.08
 
 
 class Fronts(NamedTuple):
