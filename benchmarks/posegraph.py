@@ -32,7 +32,7 @@ import graph_stall
 import numpy as np
 import peer
 from graph_peers import PEERS, THREADS, Run, reached
-from graphs import CERTIFIED, Problem, geodesic_cost, read
+from graphs import CERTIFIED, Problem, chordal_cost, geodesic_cost, read
 from meter import machine
 
 HERE = Path(__file__).parent
@@ -204,7 +204,9 @@ def best(problem: Problem, outcomes: Sequence[Outcome]) -> Best:
     for about, poses in outcomes:
         for (name, several), ended in zip(about["runs"].items(), poses, strict=True):
             runs.setdefault(name, []).extend(Run(r["seconds"], r["costs"], ended) for r in several)
-    also = {key: value for about, _ in outcomes for key, value in about["also"].items()}
+    also = merged([about["also"] for about, _ in outcomes])
+    if "chordal_poses" in also:
+        also["chordal_cost"] = chordal_cost(problem, np.array(also.pop("chordal_poses")))
     failed = {key: value for about, _ in outcomes for key, value in about["failed"].items()}
     if not runs:
         return Best(np.inf, "none", np.inf, failed, also)
@@ -213,6 +215,15 @@ def best(problem: Problem, outcomes: Sequence[Outcome]) -> Best:
     which = min(times, key=lambda name: times[name])
     lowest = min(geodesic_cost(problem, several[0].poses) for several in runs.values())
     return Best(times[which], which, lowest, failed, also | {"times": times})
+
+
+def merged(several: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return what several processes of one solver said; of seconds, the smallest."""
+    said = {key: value for each in several for key, value in each.items()}
+    for key in said:
+        if key.endswith("_s"):
+            said[key] = min(each[key] for each in several)
+    return said
 
 
 _HEAD = (
@@ -230,6 +241,7 @@ def cells(row: Row) -> str:
         f" {row.fastest + ' ' + _short(fastest.which):28}{row.ratio:6.2f}{row.ours.geodesic:15.4f}"
         f"{row.excess:+10.1e}{row.ours.also.get('chordal_cost', np.nan):11.4f}"
         f"{row.chordal_excess:+10.1e}{f'{proof:8.3f}' if proof is not None else ''}"
+        f"{' proven' if row.ours.also.get('certified') else ''}"
     )
 
 
