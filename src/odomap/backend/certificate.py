@@ -50,7 +50,7 @@ _SHIFTS = (1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 _NEGATIVE = 1e-6
 """How negative the smallest eigenvalue may be, relative to the norm."""
 
-_SUBOPTIMAL = 1e-4
+_SUBOPTIMAL = 1e-3
 """How far the cost may be above its lower bound, relative to it."""
 
 _ROUNDING = 1e-13
@@ -237,7 +237,7 @@ class _Matrix:
         return largest_eigenvalue(
             lambda x: self.rotations(multiply(self.values, self.with_positions(x))),
             self.size,
-            tolerance=1e-2,
+            tolerance=0.1,
         )
 
     def smallest_eigenvalue(self, factor: BlockCholesky, shift: float) -> float:
@@ -251,8 +251,8 @@ class _Matrix:
 
     def decrease(self, factor: BlockCholesky) -> float:
         """Return tr(G S⁻¹ Gᵀ), what the step X − G S⁻¹ takes off tr(X S Xᵀ)."""
-        G = np.swapaxes(self.gradient, 1, 2).reshape(-1, self.space)
-        return float(np.sum(G * factor.solve(G)))
+        rows = np.ascontiguousarray(np.moveaxis(self.gradient, 1, 0)).reshape(self.space, -1)
+        return float(sum(row @ factor.solve(row) for row in rows))
 
 
 @kernel

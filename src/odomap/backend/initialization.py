@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from odomap.backend.blockcholesky import BlockCholesky
 from odomap.backend.blocks import BlockPattern
 from odomap.backend.chordal import isotropic_weights
-from odomap.backend.components import Components, find_components
+from odomap.backend.components import find_components
 from odomap.backend.posegraph import PoseGraph
+from odomap.backend.priorfit import fit_to_priors
 from odomap.backend.projection import nearest_rotations
 from odomap.backend.spanning import follow_tree, held_nodes
 from odomap.errors import InputError
@@ -64,7 +65,7 @@ def spanning_tree(graph: PoseGraph, weights: Array | None = None) -> Array:
     """
     weights = _checked(weights, graph)
     components = find_components(graph, weights)
-    return _moved_to_priors(graph, follow_tree(graph, components, weights), components)
+    return fit_to_priors(graph, follow_tree(graph, components, weights), components)
 
 
 def chordal(graph: PoseGraph, order: Index | None = None, weights: Array | None = None) -> Array:
@@ -84,29 +85,28 @@ def chordal(graph: PoseGraph, order: Index | None = None, weights: Array | None 
     weights = _checked(weights, graph)
     components = find_components(graph, weights)
     held, Ts = held_nodes(graph, components)
+    d, Zs = graph.space, graph.Ts_first_second
+    known = np.where(held[:, None, None], Ts, np.eye(d + 1))
     kappa, tau = (
         _with_trace(w, weights) for w in isotropic_weights(graph.information, graph.space)
     )
-    d, sim3 = graph.space, graph.group == "Sim3"
-    Zs, scales = graph.Ts_first_second, np.ones(graph.num_edges)
-    if sim3:
-        scales = np.cbrt(np.linalg.det(Zs[:, :d, :d]))
-    Zs_R = Zs[:, :d, :d] / scales[:, None, None]
-    known = np.where(held[:, None, None], Ts, np.eye(d + 1))
-    s = np.cbrt(np.linalg.det(known[:, :d, :d])) if sim3 else np.ones(len(Ts))
-    R, order = _rotations(graph, Zs_R, kappa, held, known[:, :d, :d] / s[:, None, None], order)
-    line = _Line(graph, held, order)
-    if sim3:
+    relaxed = _Relaxation(graph, held, order)
+    scale_known, R_known = _scale_and_rotation(known, graph)
+    scale_edge, R_edge = _scale_and_rotation(Zs, graph)
+    R = relaxed.rotations(R_edge, kappa, R_known)
+    if graph.group == "Sim3":
         omega = _with_trace(graph.information[:, 6, 6], weights)
-        s = np.exp(line.solve(np.log(scales)[:, None], omega, np.log(s)[:, None])[:, 0])
-        R = s[:, None, None] * R
-        tau = tau / s[graph.second] ** 2
+        log_scale = relaxed.along(np.log(scale_edge)[:, None], omega, np.log(scale_known)[:, None])[
+            :, 0
+        ]
+        R *= np.exp(log_scale)[:, None, None]
+        tau = tau * np.exp(-2.0 * log_scale[graph.second])
     steps = (R[graph.first] @ Zs[:, :d, d:])[:, :, 0]
     out = np.zeros(Ts.shape)
     out[:, :d, :d], out[:, d, d] = R, 1.0
-    out[:, :d, d] = line.solve(steps, tau, known[:, :d, d])
+    out[:, :d, d] = relaxed.along(steps, tau, known[:, :d, d])
     out[held] = Ts[held]
-    return _moved_to_priors(graph, out, components)
+    return fit_to_priors(graph, out, components)
 
 
 def place_landmarks(graph: PoseGraph, Ts_world_node: Array) -> Array:
@@ -151,99 +151,58 @@ def _with_trace(precision: Array, weights: Array) -> Array:
     return np.where(weights > 0.0, np.maximum(precision * weights, least), 0.0)
 
 
-def _rotations(
-    graph: PoseGraph, Zs: Array, kappa: Array, held: Bool, known: Array, order: Index | None
-) -> tuple[Array, Index]:
-    """Return rotations (N, d, d) by relaxation and projection, and the order of elimination."""
-    n, d = graph.num_nodes, graph.space
-    pattern = BlockPattern.of(np.full(n, d), graph.first, graph.second)
-    factor = BlockCholesky(pattern, order)
-    values, b = np.zeros(pattern.num_values), np.zeros((n, d, d))
-    _rotation_equations(
-        graph.first,
-        graph.second,
-        np.ascontiguousarray(Zs),
-        kappa,
-        held,
-        np.ascontiguousarray(np.swapaxes(known, 1, 2)),
-        pattern.pair_start[pattern.pair_of(graph.first, graph.second)],
-        pattern.diagonal_start,
-        values,
-        b,
-    )
-    _factored(factor, values)
-    X = factor.solve(b.reshape(n * d, d)).reshape(n, d, d)
-    return nearest_rotations(np.swapaxes(X, 1, 2)), factor.order
+def _scale_and_rotation(Ts: Array, graph: PoseGraph) -> tuple[Array, Array]:
+    """Return scales (n,), which are 1 but in Sim3, and rotations (n, d, d)."""
+    A = Ts[:, : graph.space, : graph.space]
+    if graph.group != "Sim3":
+        return np.ones(len(A)), A
+    scale = np.cbrt(np.linalg.det(A))
+    return scale, A / scale[:, None, None]
 
 
-class _Line:
-    """Weighted least squares x_j − x_i ≈ steps on the edges of a graph, some x held."""
+class _Relaxation:
+    """The linear systems of a graph, some nodes held: one pattern and order, two block sizes."""
 
-    def __init__(self, graph: PoseGraph, held: Bool, order: Index) -> None:
-        self.pattern = BlockPattern.of(np.ones(graph.num_nodes), graph.first, graph.second)
-        self.pair = self.pattern.pair_start[self.pattern.pair_of(graph.first, graph.second)]
+    def __init__(self, graph: PoseGraph, held: Bool, order: Index | None) -> None:
+        n = graph.num_nodes
+        self.ends, self.held, self.space = (graph.first, graph.second), held, graph.space
+        self.pattern = BlockPattern.of(np.ones(n), *self.ends)
+        self.pair = self.pattern.pair_of(*self.ends)
         self.factor = BlockCholesky(self.pattern, order)
-        self.ends = graph.first, graph.second
-        self.held = held
 
-    def solve(self, steps: Array, weights: Array, known: Array) -> Array:
-        """Return x (N, k), given steps (E, k), weights (E,) and x (N, k) of nodes held."""
+    def rotations(self, Zs: Array, kappa: Array, known: Array) -> Array:
+        """Return R (N, d, d), given those of edges (E, d, d), κ (E,) and R of nodes held."""
+        d, n = self.space, len(known)
+        pattern = BlockPattern(np.full(n, d), self.pattern.first, self.pattern.second)
+        factor = BlockCholesky(pattern, self.factor.order)
+        values, b = np.zeros(pattern.num_values), np.zeros((n, d, d))
+        edges, X_known = np.ascontiguousarray(Zs), _transposed(known)
+        places = pattern.pair_start[self.pair], pattern.diagonal_start
+        _rotation_equations(*self.ends, edges, kappa, self.held, X_known, *places, values, b)
+        X = _solved(factor, values, b.reshape(n * d, d)).reshape(n, d, d)
+        return nearest_rotations(_transposed(X))
+
+    def along(self, steps: Array, weights: Array, known: Array) -> Array:
+        """Return x (N, k) with x_j − x_i ≈ steps (E, k), given weights (E,) and x of nodes held."""
         values, b = np.zeros(self.pattern.num_values), np.zeros(known.shape)
         steps, known = np.ascontiguousarray(steps), np.ascontiguousarray(known)
-        _step_equations(*self.ends, steps, weights, self.held, known, self.pair, values, b)
-        _factored(self.factor, values)
-        return self.factor.solve(b)
+        pair = self.pattern.pair_start[self.pair]
+        _step_equations(*self.ends, steps, weights, self.held, known, pair, values, b)
+        return _solved(self.factor, values, b)
 
 
-def _factored(factor: BlockCholesky, values: Array) -> None:
+def _transposed(matrices: Array) -> Array:
+    return np.ascontiguousarray(np.swapaxes(matrices, 1, 2))
+
+
+def _solved(factor: BlockCholesky, values: Array, b: Array) -> Array:
+    """Return x with A x = b, column by column: for two or three that is the fastest."""
     if not factor.factor(values):
         raise InputError(
             "initialisation: weights of edges differ too much for linear equations "
             f"(at node {factor.failed_block}): leave out edges of negligible information"
         )
-
-
-def _moved_to_priors(graph: PoseGraph, Ts: Array, components: Components) -> Array:
-    """Return poses, every component without a fixed node moved as a whole to fit its priors.
-
-    The motion A minimises Σ κ |R_p − A_R R_i|² + τ |t_p − A t_i|², scales matched first.
-    """
-    priors, d, count = graph.priors, graph.space, components.count
-    label = components.label[priors.node]
-    use = ~components.has_fixed[label]
-    if not use.any():
-        return Ts
-    label, target, own = label[use], priors.Ts_world_node[use], Ts[priors.node[use]]
-    information = priors.information[use]
-    kappa, tau = isotropic_weights(information, d)
-
-    def total(weight: Array, of: Array) -> Array:
-        sums = np.zeros((count, *of.shape[1:]))
-        np.add.at(sums, label, weight.reshape(-1, *[1] * (of.ndim - 1)) * of)
-        return sums
-
-    def mean(weight: Array, of: Array) -> Array:
-        norm = total(weight, np.ones(len(of))).reshape(-1, *[1] * (of.ndim - 1))
-        return np.asarray(total(weight, of) / np.where(norm > 0.0, norm, 1.0))
-
-    R_p, R_i, t_p, t_i = target[:, :d, :d], own[:, :d, :d], target[:, :d, d], own[:, :d, d]
-    s = np.ones(count)
-    if graph.group == "Sim3":
-        ratio = np.log(np.linalg.det(R_p) / np.linalg.det(R_i)) / 3.0
-        s = np.exp(mean(information[:, 6, 6], ratio))
-    p_mean, i_mean = mean(tau, t_p), mean(tau, t_i)
-    lever = s[label, None] * (t_i - i_mean[label])
-    M = total(kappa, R_p @ np.swapaxes(R_i, 1, 2))
-    M += total(tau, (t_p - p_mean[label])[:, :, None] * lever[:, None, :])
-    # Turns that no prior measures are not made.
-    M += 1e-9 * np.maximum(np.abs(M).max(axis=(1, 2)), 1e-300)[:, None, None] * np.eye(d)
-    A = nearest_rotations(M)
-    shift = p_mean - (s[:, None, None] * A @ i_mean[:, :, None])[:, :, 0]
-    shift[total(tau, np.ones(len(own))) <= 0.0] = 0.0
-    moves = np.zeros((count, d + 1, d + 1))
-    moves[:, :d, :d], moves[:, :d, d], moves[:, d, d] = s[:, None, None] * A, shift, 1.0
-    moves[np.bincount(label, minlength=count) == 0] = np.eye(d + 1)
-    return np.asarray(moves[components.label] @ Ts)
+    return np.stack([factor.solve(column) for column in np.ascontiguousarray(b.T)], axis=1)
 
 
 @kernel

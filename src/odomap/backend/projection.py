@@ -75,7 +75,7 @@ def _quadratic_form(M: Array, K: Array) -> None:
     for a in range(3):
         for b in range(3):
             largest = max(largest, abs(M[a, b]))
-    scale = 1.0 / largest if largest > 0.0 else 0.0
+    scale = 1.0 / largest if largest > 1e-300 else 0.0
     trace = M[0, 0] + M[1, 1] + M[2, 2]
     K[0, 0] = scale * trace
     K[0, 1] = scale * (M[2, 1] - M[1, 2])
