@@ -130,9 +130,9 @@ def optimize(
         seconds = time.perf_counter() - start
         written = _write(file.graph, solution, out, picture)
         is_interrupted = interrupt.is_set()
-    tell(0, 0, "proof" if certify else "done")
     certificate = None
     if certify and not is_interrupted:
+        tell(0, 0, "proof")
         certificate = prove(solution.graph.without(solution.is_rejected))
     labels = find_components(file.graph, through_landmarks=True).label
     sizes = tuple(int(n) for n in sorted(np.bincount(labels), reverse=True))
