@@ -306,6 +306,7 @@ SPACE = [
             SPACE[0].replace(" 0", " 9", 1),
             ":4: VERTEX_SE3:QUAT does not go with the EDGE_SE2",
         ),
+        (START, "49 7776 31843", ":4: a line begins with a tag, not 49: is it a BAL problem"),
         (START, "EDGE_SE22 0 1", ":4: tag 'EDGE_SE22' is unknown (did you mean 'EDGE_SE2'?)"),
         (SPACE, f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 0 {I3}", ":4: a quaternion of zeros"),
         (SPACE, "VERTEX_SE3:QUAT 2 1 0 0 0 0 0 0", ":4: a quaternion of zeros"),

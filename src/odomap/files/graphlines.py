@@ -136,6 +136,8 @@ def _grouped(text: str) -> tuple[dict[str, list[list[str]]], dict[str, list[int]
 def _unknown(tag: str, layouts: Mapping[str, Layout]) -> str:
     if not tag.isprintable() or not tag.isascii():
         return "is not text of a graph: give a g2o or TORO file"
+    if _complaint(tag, whole=False) == "":
+        return f"a line begins with a tag, not {tag[:40]}: is it a BAL problem (odomap bundle)?"
     shown = tag if len(tag) <= 40 else f"{tag[:40]}…"
     return f"tag '{shown}' is unknown{nearest_name(tag, layouts)}; --skip-unknown reads the rest"
 
