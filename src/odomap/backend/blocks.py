@@ -154,7 +154,7 @@ class BlockPattern:
             raise InputError(f"block pattern: x has shape {x.shape} (first axis: {self.size})")
         y = np.zeros(x.shape)
         starts = self.row_start, self.diagonal_start, self.pair_start
-        columns = np.ascontiguousarray(x.reshape(self.size, -1))
+        columns = np.ascontiguousarray(x if x.ndim == 2 else x[:, None])
         _multiply(
             self.sizes, self.first, self.second, *starts, values, columns, y.reshape(columns.shape)
         )

@@ -58,7 +58,7 @@ class QdldlFactor:
         values[self.pattern.diagonal] += shift
         self._solver, self.failed_block = None, -1
         if not np.isfinite(values).all():
-            return self._fail(int(self.pattern.diagonal[0]) if len(values) else 0)
+            return self._fail(0)
         if not self.pattern.size:
             self._pivots = np.zeros(0)
             return True
@@ -86,7 +86,10 @@ class QdldlFactor:
         solve = self._solver.solve  # type: ignore[attr-defined]
         if b.ndim == 1:
             return np.asarray(solve(b))
-        return np.column_stack([solve(np.ascontiguousarray(c)) for c in b.T]).reshape(b.shape)
+        x = np.empty(b.shape)
+        for c in range(b.shape[1]):
+            x[:, c] = solve(np.ascontiguousarray(b[:, c]))
+        return x
 
     def log_determinant(self) -> float:
         """Return log det (A + shift·I)."""

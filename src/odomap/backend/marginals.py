@@ -125,7 +125,9 @@ def marginal_blocks(factor: BlockCholesky, blocks: ArrayLike) -> Array:
     columns = -(-size // GROUP) * GROUP
     if 4.0 * columns * entries.sum() > 3.0 * factor.flops:
         return Marginals(factor).blocks(chosen)
-    return np.array([joint_covariance(factor, [b]) for b in chosen]).reshape(-1, size, size)
+    return np.array([joint_covariance(factor, [b]) for b in chosen]).reshape(
+        len(chosen), size, size
+    )
 
 
 def joint_covariance(factor: BlockCholesky, blocks: ArrayLike) -> Array:
