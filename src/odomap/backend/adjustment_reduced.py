@@ -1,0 +1,169 @@
+"""Solving the reduced system of bundle adjustment: by factors, or by conjugate gradients.
+
+A step δ of all views and lenses solves S δ = -s. `Factored` makes S in blocks and factors it
+(`BlockCholesky`): exact, and cheap as long as views see little of what others see; a handful of
+views all of which see each other is one dense front. `Conjugate` never makes S. Which is quicker
+is known before the first step:
+
+    factored     flops of the factor, and of the products V Vᵀ
+    iterative    products of S with some tens of vectors
+
+Reference: S. Agarwal, N. Snavely, S. Seitz, R. Szeliski, "Bundle adjustment in the large",
+ECCV 2010.
+"""
+
+from collections.abc import Callable
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend import adjustment_cg as cg
+from odomap.backend.adjustment_layout import Layout
+from odomap.backend.adjustment_normal import System
+from odomap.backend.adjustment_schur import (
+    add_couplings,
+    damped_diagonal,
+    pattern_of,
+    reduced_matrix,
+)
+from odomap.backend.blockcholesky import BlockCholesky
+from odomap.errors import InputError
+
+__all__ = ["METHODS", "Factored", "Iterative", "Method", "Reduced", "reduced_solver"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Method = Literal["auto", "factored", "iterative"]
+METHODS = ("auto", "factored", "iterative")
+
+FLOPS_PER_PRODUCT = 60.0
+"""Products S x that a step of conjugate gradients is expected to take."""
+SLOWER = 4.0
+"""By how much a flop of a product, fetched from memory, costs more than one of a factor."""
+MAX_NUMBERS = 2**28
+"""Numbers a factor may have: 2 GB."""
+CHUNK = 10
+"""Steps of conjugate gradients between two looks at the stop flag."""
+
+
+class Reduced(Protocol):
+    """What solves the reduced system."""
+
+    @property
+    def inner(self) -> int:
+        """How many products or factorisations the last step took."""
+        ...
+
+    def step(self, system: System, damping: float, stopped: Callable[[], bool]) -> Array | None:
+        """Return δ (n,), or None where the system is not positive definite."""
+        ...
+
+
+class Factored:
+    """Makes S and factors it."""
+
+    def __init__(self, layout: Layout, lens: Index) -> None:
+        self.layout, self.lens = layout, lens
+        self.pattern = pattern_of(layout, lens)
+        self.factor = BlockCholesky(self.pattern)
+        self.inner = 1
+        blocks = layout.blocks
+        self._values = np.empty(self.pattern.num_values)
+        self._s = np.empty(self.pattern.size)
+        self._row_pair = np.searchsorted(self.pattern.first, np.arange(len(blocks.size) + 1))
+        self._slot = np.zeros(len(blocks.size), np.int64)
+        is_coupled = (blocks.pose >= 0) & (blocks.lens[lens] >= 0) & (not layout.is_joined)
+        self._coupled = np.full(len(lens), -1)
+        self._coupled[is_coupled] = self.pattern.pair_of(
+            blocks.pose[is_coupled], blocks.lens[lens[is_coupled]]
+        )
+
+    def assemble(self, system: System, damping: float) -> tuple[Array, Array]:
+        """Return the values of S and s (n,)."""
+        blocks, pattern = self.layout.blocks, self.pattern
+        damped_diagonal(blocks, system.A, damping, self._values)
+        add_couplings(
+            blocks, self.lens, system.coupling, self._coupled, pattern.pair_start, self._values
+        )
+        reduced_matrix(
+            blocks,
+            self.layout.incidences,
+            pattern.second,
+            self._row_pair,
+            pattern.pair_start,
+            system,
+            self._slot,
+            self._values,
+            self._s,
+        )
+        return self._values, self._s
+
+    def step(self, system: System, damping: float, stopped: Callable[[], bool]) -> Array | None:
+        """Return δ (n,), or None where the system is not positive definite."""
+        values, s = self.assemble(system, damping)
+        return self.factor.solve(-s) if self.factor.factor(values) else None
+
+
+class Iterative:
+    """Conjugate gradients, preconditioned by the diagonal blocks of S."""
+
+    def __init__(self, layout: Layout, lens: Index, steps: int, eta: float) -> None:
+        self.layout, self.lens, self.steps, self.eta = layout, lens, steps, eta
+        self.inner = 0
+        blocks = layout.blocks
+        n = int(blocks.row[-1])
+        x, r, p, z, Sp = np.zeros((5, n))
+        self._state = cg.Conjugate(x, r, p, z, Sp, np.zeros(3))
+        self._D, self._M = np.zeros(int(blocks.at[-1])), np.zeros(int(blocks.at[-1]))
+        self._s = np.zeros(n)
+
+    def step(self, system: System, damping: float, stopped: Callable[[], bool]) -> Array | None:
+        """Return δ (n,), or None where the system is not positive definite."""
+        blocks, incidences = self.layout.blocks, self.layout.incidences
+        damped_diagonal(blocks, system.A, damping, self._D)
+        self.inner = 0
+        if not cg.precondition(blocks, incidences, self._D, system, self._M, self._s):
+            return None
+        cg.start_conjugate(blocks, self._M, self._s, self._state)
+        done = False
+        while not done and self.inner < self.steps and not stopped():
+            done = cg.conjugate_steps(
+                blocks,
+                incidences,
+                self._D,
+                self.lens,
+                system.coupling,
+                system.V,
+                self._M,
+                self._s,
+                min(CHUNK, self.steps - self.inner),
+                self.eta,
+                self._state,
+            )
+            self.inner = int(self._state.scalars[2])
+        return self._state.x.copy()
+
+
+def reduced_solver(
+    layout: Layout, lens: Index, method: Method, steps: int, eta: float
+) -> Factored | Iterative:
+    """Return what solves the reduced system of a problem.
+
+    Args:
+        layout: of the problem.
+        lens: (K,) of each view.
+        method: "auto" takes what promises to be quicker and fits into memory.
+        steps: most conjugate gradient steps.
+        eta: when these are good enough.
+    """
+    if method not in METHODS:
+        raise InputError(f"adjust: method '{method}' is unknown, give {', '.join(METHODS)}")
+    if method == "iterative":
+        return Iterative(layout, lens, steps, eta)
+    factored = Factored(layout, lens)
+    product = 4.0 * float(layout.incidences.at[-1])
+    is_quick = factored.factor.flops <= FLOPS_PER_PRODUCT * SLOWER * product
+    if method == "factored" or (is_quick and factored.factor.num_nonzeros <= MAX_NUMBERS):
+        return factored
+    return Iterative(layout, lens, steps, eta)
