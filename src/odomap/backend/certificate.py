@@ -64,7 +64,7 @@ class Certificate:
     Attributes:
         certified: whether the poses are proven to be the global minimum of the chordal cost.
         reason: why, or why not, as a sentence.
-        cost: chordal cost f of the poses.
+        cost: chordal cost f of the poses, priors counted as edges from the world.
         lower_bound: no poses whatever cost less than this.
         smallest_eigenvalue: λ_min of SE-Sync's certificate matrix S̃, positions eliminated.
         norm: largest eigenvalue of the same matrix before positions are eliminated, |S|.
@@ -99,8 +99,8 @@ def certify(graph: PoseGraph, order: Index | None = None) -> Certificate:
         Certificate.
 
     Raises:
-        InputError: the graph is in Sim3, has landmarks, priors or several fixed nodes in one
-            component, or poses that are not known.
+        InputError: the graph is in Sim3, has landmarks, a component that more than one fixed node
+            or both a fixed node and a prior hold, or poses that are not known.
 
     Example:
         >>> Ts = np.stack([np.eye(3)] * 3)
@@ -109,10 +109,12 @@ def certify(graph: PoseGraph, order: Index | None = None) -> Certificate:
         True
     """
     count = check_certifiable(graph)
+    if len(graph.priors.node):
+        graph, order = _with_world(graph), None
     d = graph.space
     Ts = graph.Ts_world_node.copy()
-    cost = chordal_cost(graph)
     Ts[:, :d, :d] = nearest_rotations(Ts[:, :d, :d])
+    cost = chordal_cost(graph.placed(Ts))
     matrix = _Matrix.at(graph, Ts)
     norm = matrix.norm()
     factor = BlockCholesky(matrix.pattern, order)
@@ -141,23 +143,38 @@ def check_certifiable(graph: PoseGraph) -> int:
     """Return how many components a graph has, if it is of a kind that can be certified.
 
     Raises:
-        InputError: it is in Sim3, has landmarks, priors or several fixed nodes in one component.
+        InputError: it is in Sim3, has landmarks, or a component that more than one fixed node or
+            both a fixed node and a prior hold.
     """
     if graph.group == "Sim3":
         raise InputError("certificate: there is none for Sim3, only for SE2 and SE3")
     if len(graph.points.node):
         raise InputError("certificate: there is none for landmarks, only for poses")
-    if len(graph.priors.node):
-        raise InputError("certificate: there is none with priors, only for relative motions")
     components = find_components(graph)
-    fixed = np.bincount(components.label[graph.is_fixed], minlength=components.count)
-    if (fixed > 1).any():
-        node = graph.ids[components.anchor[np.argmax(fixed > 1)]]
+    holds = np.bincount(components.label[graph.is_fixed], minlength=components.count)
+    # All priors are edges from the same node, the world, which holds every component they are in.
+    holds += components.has_prior
+    if (holds > 1).any():
+        node = graph.ids[components.anchor[np.argmax(holds > 1)]]
         raise InputError(
-            f"certificate: {fixed.max()} nodes are fixed in the component of node {node}; "
-            "one only may be, as more of them are measurements the proof does not know"
+            f"certificate: more than one fixed node, or one beside priors, holds node {node} and "
+            "those tied to it; fix one only, as the proof knows nothing of fixed nodes"
         )
     return components.count
+
+
+def _with_world(graph: PoseGraph) -> PoseGraph:
+    """Return the graph with the world as its last node, and priors as edges from there."""
+    priors, n = graph.priors, graph.num_nodes
+    world = np.full(len(priors.node), n)
+    return PoseGraph(
+        graph.group,
+        np.concatenate([graph.Ts_world_node, np.eye(graph.space + 1)[None]]),
+        np.concatenate([graph.first, world]),
+        np.concatenate([graph.second, priors.node]),
+        np.concatenate([graph.Ts_first_second, priors.Ts_world_node]),
+        np.concatenate([graph.information, priors.information]),
+    )
 
 
 def _shift(matrix: "_Matrix", factor: BlockCholesky, norm: float) -> float:

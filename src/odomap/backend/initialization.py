@@ -218,7 +218,7 @@ def _rotation_equations(
     values: Array,
     b: Array,
 ) -> None:
-    """Normal equations of Σ κ |X_j − Zᵀ X_i|², X = Rᵀ: A_ii, A_jj += κ I, A_ij −= κ Z.
+    """Normal equations of Σ κ |X_j − Zᵀ X_i|², X = Rᵀ: A_ii += κ Z Zᵀ, A_jj += κ I, A_ij −= κ Z.
 
     Rows of nodes held say X = known, and their columns go to the right-hand side.
     """
@@ -226,11 +226,12 @@ def _rotation_equations(
     for e in range(len(first)):
         i, j, w = first[e], second[e], kappa[e]
         for a in range(d):
-            if not held[i]:
-                values[diagonal[i] + a * (d + 1)] += w
             if not held[j]:
                 values[diagonal[j] + a * (d + 1)] += w
             for c in range(d):
+                if not held[i]:  # Z Zᵀ, as rotations in files are rounded
+                    for k in range(d):
+                        values[diagonal[i] + a * d + c] += w * Zs[e, a, k] * Zs[e, c, k]
                 if held[i] or held[j]:
                     for k in range(d):
                         if not held[j]:

@@ -59,7 +59,7 @@ def fit_to_priors(graph: PoseGraph, Ts_world_node: Array, components: Components
     M = _sums(kappa, R_p @ np.swapaxes(R_i, 1, 2), label, count)
     M += _sums(tau, (t_p - p_mean[label])[:, :, None] * lever[:, None, :], label, count)
     # A turn that no prior measures is not made.
-    M += 1e-9 * np.maximum(np.abs(M).max(axis=(1, 2)), 1e-200)[:, None, None] * np.eye(d)
+    M += 1e-12 * np.maximum(np.abs(M).max(axis=(1, 2)), 1e-200)[:, None, None] * np.eye(d)
     R = s[:, None, None] * nearest_rotations(M)
     moves = np.zeros((count, d + 1, d + 1))
     moves[:, :d, :d], moves[:, d, d] = R, 1.0
