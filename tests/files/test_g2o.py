@@ -334,17 +334,12 @@ def test_broken_offsets(tmp_path):
         read_g2o(text(tmp_path, *SPACE, "PARAMS_SE3OFFSET 3 0 0 1 0 0 0 0", edge))
 
 
-def test_scales_are_positive(tmp_path):
-    line = "VERTEX_SIM3:QUAT 0 0 0 0 0 0 0 1"
-    with pytest.raises(InputError, match=r":2: a scale that is not positive"):
-        read_g2o(
-            text(
-                tmp_path,
-                f"{line} 2",
-                f"{line.replace(' 0', ' 1', 1)} -1",
-                "EDGE_SIM3:QUAT 0 1 0 0 0 0 0 0 1 1 " + " ".join(["0"] * 28),
-            )
-        )
+@pytest.mark.parametrize("scale", ["0", "-1", "1e-320", "1e300"])
+def test_scales_are_positive_and_not_absurd(tmp_path, scale):
+    start = ["VERTEX_SIM3:QUAT 0 0 0 0 0 0 0 1 2", f"VERTEX_SIM3:QUAT 1 0 0 0 0 0 0 1 {scale}"]
+    edge = "EDGE_SIM3:QUAT 0 1 0 0 0 0 0 0 1 1 " + " ".join(["0"] * 28)
+    with pytest.raises(InputError, match=r":2: a scale that cannot be"):
+        read_g2o(text(tmp_path, *start, edge))
 
 
 def test_no_edges_no_text_no_file(tmp_path):

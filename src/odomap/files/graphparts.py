@@ -28,6 +28,8 @@ __all__ = ["Parts"]
 
 SHORTEST = 1e-12
 """A quaternion with no larger number is one of zeros."""
+LARGEST_SCALE = 60
+"""Powers of ten: cubes of scales must be numbers, too."""
 
 
 @dataclass(frozen=True)
@@ -190,8 +192,8 @@ class Parts:
             wrong = np.abs(numbers[:, 3:7]).max(axis=1) < SHORTEST
             what = "a quaternion of zeros: is its order x y z w?"
             if self.group == "Sim3" and not wrong.any():
-                wrong = numbers[:, 7] <= 0.0
-                what = "a scale that is not positive"
+                wrong = np.abs(np.log10(np.maximum(numbers[:, 7], 1e-300))) > LARGEST_SCALE
+                what = "a scale that cannot be: is it a positive number, the last of the pose?"
             if wrong.any():
                 raise InputError(f"{self.file}:{rows.lines[int(np.argmax(wrong))]}: {what}")
         return poses_from_numbers(numbers, self.group)
