@@ -8,12 +8,11 @@ chordal cost of SE-Sync to its optimum, and the certificate of that optimum.
 """
 
 import argparse
-import os
 import time
 from pathlib import Path
 from typing import Any
 
-from graph_peers import Run, write  # isort: skip; first: sets the threads of what numpy brings
+from graph_peers import Run, pin, write  # isort: skip; first: sets the threads of what numpy brings
 
 from graphs import Problem, load
 
@@ -44,8 +43,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--core", type=int, default=-1, help="run on this one alone")
     options = parser.parse_args()
-    if options.core >= 0 and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {options.core})
+    pin(options.core)
     problem = load(options.problem)
     timed(problem)  # compiles
     runs = [timed(problem) for _ in range(options.repeats)]

@@ -44,6 +44,12 @@ class Run:
     poses: Array
 
 
+def pin(core: int) -> None:
+    """Keep this process on one core, where the system lets it."""
+    if core >= 0 and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core})
+
+
 def reached(run: Run, final: float) -> float:
     """Return the seconds after which the cost stays within 1e-4 of a final one; inf if never."""
     there = np.asarray(run.costs) <= final * (1 + CLOSE)
@@ -285,8 +291,7 @@ def main() -> None:
     parser.add_argument("--cap", type=float, default=20.0, help="seconds of one run")
     parser.add_argument("--core", type=int, default=-1, help="run on this one alone")
     options = parser.parse_args()
-    if options.core >= 0 and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {options.core})
+    pin(options.core)
     with np.load(options.problem) as arrays:
         problem = dict(arrays)
     try:

@@ -17,7 +17,6 @@ one, the certificates of sphere2500 and torus3D in 0.5 s.
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -31,11 +30,11 @@ import graph_phases
 import graph_stall
 import numpy as np
 import peer
-from graph_peers import PEERS, THREADS, Run, reached
+from graph_peers import PEERS, Run, reached
 from graphs import CERTIFIED, Problem, chordal_cost, geodesic_cost, read
 from meter import machine
+from runs import HERE, Outcome, last_core, merged, outcome
 
-HERE = Path(__file__).parent
 LEAST_TIMED = 1000
 """Poses from which times count: below, calls of Python are what is timed."""
 LARGEST_TIME_RATIO = 1.0
@@ -134,7 +133,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cap", type=float, default=20.0, help="seconds of one run of a peer")
-    parser.add_argument("--core", type=int, default=_last_core(), help="which one; -1 for any")
+    parser.add_argument("--core", type=int, default=last_core(), help="which one; -1 for any")
     parser.add_argument("--verbose", action="store_true", help="print all configurations")
     parser.add_argument("--profile", action="store_true", help="where our time goes")
     parser.add_argument("--stall", action="store_true", help="how long other threads wait")
@@ -146,10 +145,6 @@ def _options() -> argparse.Namespace:
     if not (options.graphs or options.growth):
         peer.require(parser, options, ("data",))
     return options
-
-
-def _last_core() -> int:
-    return max(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else -1
 
 
 def _problems(options: argparse.Namespace, names: Sequence[str] = ()) -> list[Problem]:
@@ -178,26 +173,6 @@ def compare(options: argparse.Namespace, problem: Problem, scratch: Path) -> Row
     return Row(problem.name, len(problem.poses), len(problem.first), mine, found)
 
 
-Outcome = tuple[dict[str, Any], list[np.ndarray]]
-"""What a solver's process wrote: about its runs, and where each configuration ended."""
-
-
-def outcome(command: list[str], options: list[str], scratch: Path) -> Outcome:
-    """Run a solver's process, its numeric libraries in one thread; read what it wrote."""
-    out = scratch / "out.npz"
-    out.unlink(missing_ok=True)
-    env = os.environ | dict.fromkeys(THREADS, "1")
-    done = subprocess.run(
-        [*command, str(out), *options], env=env, capture_output=True, text=True, check=False
-    )
-    if done.returncode != 0 or not out.exists():
-        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        sys.exit(f"{' '.join(command[:3])} failed: {lines[-1]}")
-    with np.load(out) as arrays:
-        about = json.loads(str(arrays["about"]))
-        return about, [arrays[f"poses_{n}"] for n in range(len(about["runs"]))]
-
-
 def best(problem: Problem, outcomes: Sequence[Outcome]) -> Best:
     """Return the fastest configuration: all must reach the lowest cost that any has reached."""
     runs: dict[str, list[Run]] = {}
@@ -215,15 +190,6 @@ def best(problem: Problem, outcomes: Sequence[Outcome]) -> Best:
     which = min(times, key=lambda name: times[name])
     lowest = min(geodesic_cost(problem, several[0].poses) for several in runs.values())
     return Best(times[which], which, lowest, failed, also | {"times": times})
-
-
-def merged(several: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return what several processes of one solver said; of seconds, the smallest."""
-    said = {key: value for each in several for key, value in each.items()}
-    for key in said:
-        if key.endswith("_s"):
-            said[key] = min(each[key] for each in several)
-    return said
 
 
 _HEAD = (
