@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 FLAT = 0.15
-"""What is lower than this share of its least width is seen from above."""
+"""What is lower than this share of its width is seen from above."""
 AZIMUTH, ELEVATION = np.radians(35.0), np.radians(28.0)
 MOST_EDGES = 20000
 MOST_POINTS = 5000
@@ -58,6 +58,7 @@ def graph_figure(
         else:
             dress(ax, title, f"{AXES[0]} [m]", f"{AXES[1]} [m]")
         _draw(ax, after, positions, oblique, none if rejected is None else rejected)
+    _draw_landmarks(axes[-1], after.points.points_world, oblique)
     handles, labels = axes[-1].get_legend_handles_labels()
     legend(axes[-1], handles=handles, labels=labels, ncols=4)
     return figure
@@ -66,7 +67,7 @@ def graph_figure(
 def _is_spatial(positions: Array) -> bool:
     """Whether a graph is so high that a look from above would hide it."""
     extent = np.ptp(positions, axis=0)
-    return len(extent) == 3 and bool(extent[2] > FLAT * min(extent[:2].max(), 1e300))
+    return len(extent) == 3 and bool(extent[2] > FLAT * extent[:2].max())
 
 
 def _draw(ax: Axes, graph: PoseGraph, positions: Array, oblique: bool, rejected: Bool) -> None:
@@ -84,14 +85,16 @@ def _draw(ax: Axes, graph: PoseGraph, positions: Array, oblique: bool, rejected:
             lines = LineCollection(list(some), colors=colour, linewidths=width, zorder=order)
             lines.set_label(label)
             ax.add_collection(lines)
-    points = graph.points.points_world
+    ax.update_datalim(flat)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.autoscale_view()
+
+
+def _draw_landmarks(ax: Axes, points: Array, oblique: bool) -> None:
     if len(points):
         seen = _projected(points[thin(len(points), MOST_POINTS)], oblique)
         style = {"marker": "o", "ms": 1.8, "ls": "", "color": PALETTE["keyframe"]}
         ax.plot(seen[:, 0], seen[:, 1], label="landmark", zorder=4, **style)  # type: ignore[arg-type]
-    ax.update_datalim(flat)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.autoscale_view()
 
 
 def _projected(points: Array, oblique: bool) -> Array:
