@@ -1,9 +1,9 @@
 """Manhattan worlds of any size, and how the time to solve them grows.
 
-A robot walks along the streets of a grid, a metre per pose, and turns at random at every third
-crossing; where it comes to within a metre of a place it has been to, it often measures its pose
-relative to that place. A random walk of N steps stays within about √N, so that every size has
-about as many loops per pose: the graph grows, and does not get denser.
+A robot walks through a city, a metre per pose, and at every crossing turns left or right or goes
+straight on; where it comes to within a metre of a place it has been to, it often measures its pose
+relative to that place. The city grows with the walk, so that every size has about as many loops
+per pose: the graph gets larger, and not denser.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from odomap.views.style import PALETTE, dress, figure_png, legend, new_figure
 
 Array = NDArray[np.float64]
 SIZES = (1000, 2000, 5000, 10000, 20000)
-BLOCK = 3
+BLOCK = 5
 """Metres between crossings."""
 SIGMAS = np.array([0.05, 0.05, 0.01])
 """Of what is measured: metres, metres, radians."""
@@ -44,18 +44,22 @@ def manhattan(poses: int, seed: int = 0) -> Problem:
 
 
 def _walk(poses: int, rng: np.random.Generator) -> Array:
-    """Return true poses (N, 3, 3) along the streets."""
-    steps = np.arange(poses)
-    turns = np.where(steps % BLOCK == 0, rng.choice([-1, 0, 0, 1], poses), 0)
-    turns[0] = 0
-    quarter = np.cumsum(turns) % 4
-    ahead = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[quarter]
-    places = np.concatenate([np.zeros((1, 2), int), np.cumsum(ahead, axis=0)[:-1]])
+    """Return true poses (N, 3, 3) along the streets of a city that has √N metres to a side."""
+    size = BLOCK * max(2, round(np.sqrt(poses) / BLOCK))
     truth = np.tile(np.eye(3), (poses, 1, 1))
-    truth[:, 0, :2] = np.stack([ahead[:, 0], -ahead[:, 1]], axis=1)
-    truth[:, 1, :2] = np.stack([ahead[:, 1], ahead[:, 0]], axis=1)
-    truth[:, :2, 2] = places
+    place, ahead = np.array([0, 0]), np.array([1, 0])
+    for T in truth:
+        if (place % BLOCK == 0).all():
+            ways = [np.array(way) for way in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+            ways = [way for way in ways if way @ ahead >= 0 and _is_inside(place + way, size)]
+            ahead = ways[rng.integers(len(ways))]
+        T[:2, 0], T[:2, 1], T[:2, 2] = ahead, (-ahead[1], ahead[0]), place
+        place = place + ahead
     return truth
+
+
+def _is_inside(place: NDArray[np.int64], size: int) -> bool:
+    return bool((place >= 0).all() and (place <= size).all())
 
 
 def _loops(truth: Array, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

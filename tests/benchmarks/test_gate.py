@@ -58,13 +58,44 @@ def test_new_baseline_keeps_tolerances_and_other_recordings(load, tmp_path):
     }
 
 
+def test_new_baseline_keeps_what_another_benchmark_wrote(load, tmp_path):
+    gate, path = load("gate"), tmp_path / "baseline.json"
+    options = argparse.Namespace(update_baseline=True, gate=True)
+    gate.write(path, {"a": {"cpu_s": 1.0}}, {"machine": "this one"})
+    assert gate.verdict(options, "graphs", {"graphs/x": {"seconds": 0.5}}, [], path) == 0
+    content = gate.read(path)
+    assert content["machine"] == "this one"
+    assert set(content["graphs"]) == {"date", "machine"}
+    assert content["ratios"] == {"a": {"cpu_s": 1.0}, "graphs/x": {"seconds": 0.5}}
+
+
+def test_quantity_that_an_older_baseline_has_no_tolerance_for_has_the_usual(load):
+    gate = load("gate")
+    older = {"tolerance": {"cpu_s": 0.2}, "ratios": {"x": {"seconds": 1.0}}}
+    assert not gate.regressions({"x": {"seconds": 1.2}}, older)
+    assert gate.regressions({"x": {"seconds": 1.4}}, older)
+
+
+def test_missed_bar_is_an_exit_code_with_and_without_the_gate(load, tmp_path, capsys):
+    gate, path = load("gate"), tmp_path / "absent.json"
+    plain = argparse.Namespace(update_baseline=False, gate=False)
+    assert gate.verdict(plain, "graphs", {"x": {"seconds": 0.5}}, [], path) == 0
+    assert gate.verdict(plain, "graphs", {}, ["x: too slow"], path) == 1
+    assert "bar missed: x: too slow" in capsys.readouterr().out
+    assert (
+        gate.verdict(argparse.Namespace(update_baseline=False, gate=True), "g", {}, [], path) == 0
+    )
+
+
 def test_committed_baseline_covers_all_recordings(load):
     gate, sequences = load("gate"), load("sequences")
     baseline = gate.read(sequences.BASELINE)
     assert set(baseline["tolerance"]) == set(gate.TOLERANCE)
-    assert set(baseline["ratios"]) == set(sequences.RECORDINGS)
+    recorded = {name: v for name, v in baseline["ratios"].items() if "/" not in name}
+    assert set(recorded) == set(sequences.RECORDINGS)
+    assert all(set(values) == set(NUMBERS) for values in recorded.values())
     for values in baseline["ratios"].values():
-        assert set(values) == set(gate.TOLERANCE)
+        assert set(values) <= set(gate.TOLERANCE)
         assert all(np.isfinite(value) and value > 0 for value in values.values())
 
 
