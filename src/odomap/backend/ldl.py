@@ -58,7 +58,7 @@ class QdldlFactor:
         values[self.pattern.diagonal] += shift
         self._solver, self.failed_block = None, -1
         if not np.isfinite(values).all():
-            return self._fail(0)
+            return self._fail(self._row_of(int(np.argmin(np.isfinite(values)))))
         if not self.pattern.size:
             self._pivots = np.zeros(0)
             return True
@@ -94,6 +94,12 @@ class QdldlFactor:
     def log_determinant(self) -> float:
         """Return log det (A + shift·I)."""
         return float(np.log(self._pivots).sum())
+
+    def _row_of(self, place: int) -> int:
+        """Return a scalar row of the block that has the given place in `values`."""
+        starts = np.append(self.pattern.diagonal_start, self.pattern.pair_start)
+        blocks = np.append(np.arange(len(self.pattern.sizes)), self.pattern.first)
+        return int(self.pattern.row_start[blocks[np.searchsorted(starts, place, "right") - 1]])
 
     def _fail(self, row: int) -> bool:
         """Note the block of a scalar row as the place of failure."""

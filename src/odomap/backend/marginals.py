@@ -260,25 +260,28 @@ def _invert_fronts(
     inverse: Array,
 ) -> None:
     """Write Z of all fronts, from the roots down."""
-    for s in range(len(fronts.parent) - 1, -1, -1):
-        k, f, above = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.parent[s]
+    pivot, width, parent, begin = fronts.pivot, fronts.width, fronts.parent, fronts.start
+    run, runs, W, W_T, Z = fronts.run, fronts.runs, rows[0], rows[1], rows[2]
+    for s in range(len(width) - 1, -1, -1):
+        k, f, start, at, above = pivot[s + 1] - pivot[s], width[s], begin[s], place[s], parent[s]
         if above >= 0:
-            runs = fronts.runs[fronts.run[s] : fronts.run[s + 1]]
-            _take_border(runs, stack, place[above], fronts.width[above], place[s] + k * (f + 1), f)
-        start = fronts.start[s]
-        _border_rows(factor, start, k, f, stack, place[s], rows[0], rows[1], rows[2], tile)
-        _pivot_block(factor, start, k, f, stack, place[s], rows[0], rows[2], corner)
+            to = at + k * (f + 1)
+            _take_border(runs, run[s], run[s + 1], stack, place[above], width[above], to, f)
+        _border_rows(factor, start, k, f, stack, at, W, W_T, Z, tile)
+        _pivot_block(factor, start, k, f, stack, at, W, Z, corner)
         for i in range(k * f):
-            inverse[U(start + i)] = stack[U(place[s] + i)]
+            inverse[U(start + i)] = stack[U(at + i)]
 
 
 @kernel
-def _take_border(runs: Index, stack: Array, source: int, g: int, to: int, f: int) -> None:
+def _take_border(
+    runs: Index, first: int, last: int, stack: Array, source: int, g: int, to: int, f: int
+) -> None:
     """Copy Z22 of a front from its parent's Z: rows of g there, of f here."""
-    for a in range(len(runs)):
+    for a in range(first, last):
         for x in range(runs[a, 0]):
             done = to
-            for b in range(len(runs)):
+            for b in range(first, last):
                 row = source + (runs[a, 1] + x) * g + runs[b, 1]
                 for j in range(runs[b, 0]):
                     stack[U(done + j)] = stack[U(row + j)]
@@ -300,7 +303,7 @@ def _border_rows(
     tile: Array,
 ) -> None:
     """W = U11⁻¹ U12 and Z12 = −W Z22, k x m each; Z12 and its transpose go into the front."""
-    m = f - k
+    m, edge = f - k, np.int64(0)
     for p in range(k - 1, -1, -1):
         row = start + p * f
         for j in range(m):
@@ -325,7 +328,7 @@ def _border_rows(
                 for j in range(width):
                     tile[U(q * TILE + j)] = stack[U(row + j)] if a + q < m else 0.0
             for r in range(0, k, 4):
-                take_off(Z, r * m + c, m, tile, 0, W_T, a * k + r, k, width)
+                take_off(Z, r * m + c, m, tile, edge, W_T, a * k + r, k, width)
     for p in range(k):
         for j in range(m):
             stack[place + p * f + k + j] = stack[place + (k + j) * f + p] = Z[p * m + j]
@@ -370,23 +373,24 @@ def _pivot_block(
 @kernel
 def _look_up(fronts: Fronts, inverse: Array, rows: Index, columns: Index, found: Array) -> int:
     """Copy blocks of Z that begin at the given positions; return the first that is not there."""
+    pivot, border, border_rows = fronts.pivot, fronts.border, fronts.border_rows
     for e in range(len(rows)):
         low, high = min(rows[e], columns[e]), max(rows[e], columns[e])
-        s = np.searchsorted(fronts.pivot, low, side="right") - 1
+        s = np.searchsorted(pivot, low, side="right") - 1
         k, begin, end = (
-            fronts.pivot[s + 1] - fronts.pivot[s],
-            fronts.border[s],
-            fronts.border[s + 1],
+            pivot[s + 1] - pivot[s],
+            border[s],
+            border[s + 1],
         )
-        column = high - fronts.pivot[s]
+        column = high - pivot[s]
         if column >= k:
             b = begin
-            while b < end and fronts.border_rows[b] != high:
+            while b < end and border_rows[b] != high:
                 b += 1
             if b == end:
                 return e
             column = k + b - begin
-        place = fronts.start[s] + (low - fronts.pivot[s]) * fronts.width[s] + column
+        place = fronts.start[s] + (low - pivot[s]) * fronts.width[s] + column
         for a in range(found.shape[1]):
             for b in range(found.shape[2]):
                 down, right = (a, b) if rows[e] <= columns[e] else (b, a)

@@ -62,32 +62,32 @@ def factor_fronts(
 
     `stack` is (stack_size,), `scratch` (4 TILE + widest front,).
     """
+    pivot, width, begin, border = fronts.pivot, fronts.width, fronts.start, fronts.border
+    entry, entries, run, runs = fronts.entry, fronts.entries, fronts.run, fronts.runs
     tile, diagonal = scratch[: 4 * TILE], scratch[4 * TILE :]
-    owner, top, end = np.empty(len(fronts.parent) + 1, np.int64), 0, 0
-    for s in range(len(fronts.parent)):
-        k, f, start = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.start[s]
-        m = f - k
-        rest = end
-        for i in range(start, start + k * f):
-            factor[U(i)] = 0.0
+    owner, top, end = np.empty(len(width) + 1, np.int64), 0, np.int64(0)
+    for s in range(len(width)):
+        k, f, start = pivot[s + 1] - pivot[s], width[s], begin[s]
+        m, rest = f - k, end
+        for i in range(k * f):
+            factor[U(start + i)] = 0.0
         for r in range(m):
-            for c in range(r, m):
-                stack[U(rest + r * m + c)] = 0.0
-        for e in range(fronts.entry[s], fronts.entry[s + 1]):
-            _add_block(fronts.entries[e], values, factor, f)
+            for c in range(m - r):
+                stack[U(rest + r * (m + 1) + c)] = 0.0
+        for e in range(entry[s], entry[s + 1]):
+            _add_block(entries, e, values, factor, f)
         for p in range(k):
             factor[start + p * (f + 1)] += shift
             diagonal[p] = factor[start + p * (f + 1)]
         for _ in range(fronts.children[s]):
             top -= 1
             c = owner[top]
-            size = fronts.border[c + 1] - fronts.border[c]
+            size = border[c + 1] - border[c]
             end -= (size * (size + 1)) // 2
-            runs = fronts.runs[fronts.run[c] : fronts.run[c + 1]]
-            _extend_add(runs, stack, end, size, factor, start, k, f, rest)
+            _extend_add(runs, run[c], run[c + 1], stack, end, factor, start, k, f, rest)
         failed = eliminate(factor, start, k, f, stack, rest, diagonal, tile)
         if failed >= 0:
-            return int(fronts.pivot[s] + failed)
+            return int(pivot[s] + failed)
         for r in range(m):  # down to where the children's were, and packed
             for c in range(m - r):
                 stack[U(end + c)] = stack[U(rest + r * (m + 1) + c)]
@@ -98,38 +98,34 @@ def factor_fronts(
 
 
 @kernel
-def _add_block(entry: Index, values: Array, factor: Array, f: int) -> None:
+def _add_block(entries: Index, e: int, values: Array, factor: Array, f: int) -> None:
     """Copy one block of A into its front, transposed if its rows are eliminated later."""
-    source, rows, columns, place, is_transposed = entry[0], entry[1], entry[2], entry[3], entry[4]
-    if is_transposed == 1:
-        for a in range(rows):
-            for b in range(columns):
-                factor[place + b * f + a] = values[source]
-                source += 1
-    else:
-        for a in range(rows):
-            for b in range(columns):
-                factor[place + a * f + b] = values[source]
-                source += 1
+    source, place = entries[e, 0], entries[e, 3]
+    down, right = (1, f) if entries[e, 4] == 1 else (f, 1)
+    for a in range(entries[e, 1]):
+        for b in range(entries[e, 2]):
+            factor[place + a * down + b * right] = values[source]
+            source += 1
 
 
 @kernel(reorder=True)
 def _extend_add(
     runs: Index,
+    first: int,
+    last: int,
     stack: Array,
     source: int,
-    m: int,
     factor: Array,
     start: int,
     k: int,
     f: int,
     rest: int,
 ) -> None:
-    """Add a child's packed update (m rows, at `source`) to its parent's front."""
-    for a in range(len(runs)):
+    """Add a child's packed update, at `source`, to its parent's front, run by run."""
+    for a in range(first, last):
         for x in range(runs[a, 0]):
             row = runs[a, 1] + x
-            for b in range(a, len(runs)):
+            for b in range(a, last):
                 skip = x if b == a else 0
                 column, count = runs[b, 1] + skip, runs[b, 0] - skip
                 if row < k:
@@ -146,27 +142,28 @@ def _extend_add(
 @kernel(reorder=True)
 def solve_fronts(fronts: Fronts, factor: Array, x: Array, local: Array) -> None:
     """Overwrite x (n,), in the order of elimination, with the solution of Uᵀ U y = x."""
-    count = len(fronts.parent)
+    pivot, width, start, rows = fronts.pivot, fronts.width, fronts.start, fronts.border_rows
+    count = len(width)
     for s in range(count):
-        k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
+        k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
         for j in range(f):
             local[j] = 0.0
         for p in range(k):
-            row = fronts.start[s] + p * f
+            row = start[s] + p * f
             y = (x[first + p] - local[p]) / factor[row + p]
             x[first + p] = y
             for j in range(f - p - 1):
                 local[U(p + 1 + j)] += y * factor[U(row + p + 1 + j)]
         for j in range(k, f):
-            x[fronts.border_rows[border + j]] -= local[j]
+            x[rows[border + j]] -= local[j]
     for s in range(count - 1, -1, -1):
-        k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
+        k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
         for j in range(k, f):
-            local[j] = x[fronts.border_rows[border + j]]
+            local[j] = x[rows[border + j]]
         for p in range(k - 1, -1, -1):
-            row = fronts.start[s] + p * f
+            row = start[s] + p * f
             total = x[first + p]
             for j in range(f - p - 1):
                 total -= local[U(p + 1 + j)] * factor[U(row + p + 1 + j)]
@@ -181,14 +178,15 @@ def solve_group(fronts: Fronts, factor: Array, visited: Index, x: Array, local: 
     `visited` names the fronts that take part, ascending, and with each its parent. From right-hand
     sides that are zero in all others follow solutions that are right in these.
     """
+    pivot, width, start, rows = fronts.pivot, fronts.width, fronts.start, fronts.border_rows
     y = np.empty(GROUP)
     for s in visited:
-        k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
+        k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
         for j in range(f * GROUP):
             local[j] = 0.0
         for p in range(k):
-            row, at = fronts.start[s] + p * f, (first + p) * GROUP
+            row, at = start[s] + p * f, (first + p) * GROUP
             scale = 1.0 / factor[row + p]
             for g in range(GROUP):
                 y[g] = (x[at + g] - local[p * GROUP + g]) * scale
@@ -198,18 +196,18 @@ def solve_group(fronts: Fronts, factor: Array, visited: Index, x: Array, local: 
                 for g in range(GROUP):
                     local[U(j * GROUP + g)] += u * y[U(g)]
         for j in range(k, f):
-            at = fronts.border_rows[border + j] * GROUP
+            at = rows[border + j] * GROUP
             for g in range(GROUP):
                 x[at + g] -= local[j * GROUP + g]
     for s in visited[::-1]:
-        k, f, first = fronts.pivot[s + 1] - fronts.pivot[s], fronts.width[s], fronts.pivot[s]
+        k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
         for j in range(k, f):
-            at = fronts.border_rows[border + j] * GROUP
+            at = rows[border + j] * GROUP
             for g in range(GROUP):
                 local[j * GROUP + g] = x[at + g]
         for p in range(k - 1, -1, -1):
-            row, at = fronts.start[s] + p * f, (first + p) * GROUP
+            row, at = start[s] + p * f, (first + p) * GROUP
             for g in range(GROUP):
                 y[g] = x[at + g]
             for j in range(p + 1, f):

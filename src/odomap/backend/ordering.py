@@ -118,32 +118,12 @@ def _compact(begin: Index, length: Index, work: Index, spare: Index) -> int:
 
 
 @kernel
-def _take_out(i: int, d: int, head: Index, after: Index, before: Index) -> None:
-    """Remove i from the list of variables of degree d."""
-    if after[i] >= 0:
-        before[after[i]] = before[i]
-    if before[i] >= 0:
-        after[before[i]] = after[i]
-    else:
-        head[d] = after[i]
-
-
-@kernel
-def _put_in(i: int, d: int, head: Index, after: Index, before: Index) -> None:
-    """Add i to the list of variables of degree d."""
-    after[i] = head[d]
-    before[i] = -1
-    if head[d] >= 0:
-        before[head[d]] = i
-    head[d] = i
-
-
-@kernel
 def _order(first: Index, second: Index, weight: Index, absorbed: Index, rank: Index) -> None:
     """Write rank[p] of each pivot p, and into which variable or pivot each other is absorbed.
 
     In the loop weight[i] > 0 says that i is a variable of its own, < 0 that it is in the new L_p,
-    and 0 that it is gone; mark[e] = 0 that the element e is gone.
+    and 0 that it is gone; mark[e] = 0 that the element e is gone. Variables of one degree are
+    linked in both directions from head[degree].
     """
     n, total = len(weight), weight.sum()
     begin, length, elements = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
@@ -154,13 +134,18 @@ def _order(first: Index, second: Index, weight: Index, absorbed: Index, rank: In
     bucket, twin, code = np.full(n, -1), np.full(n, -1), np.zeros(n, np.int64)
     for i in range(n):
         if weight[i] > 0:
-            _put_in(i, degree[i], head, after, before)
-    stamp, least, left, step = 1, 0, total, 0
+            after[i] = head[degree[i]]
+            if after[i] >= 0:
+                before[after[i]] = i
+            head[degree[i]] = i
+    stamp, least, left, step = np.int64(1), 0, total, 0
     while left > 0:
         while head[least] < 0:
             least += 1
         pivot = head[least]
-        _take_out(pivot, least, head, after, before)
+        head[least] = after[pivot]
+        if after[pivot] >= 0:
+            before[after[pivot]] = -1
         rank[pivot] = step
         step += 1
         room = length[pivot]
@@ -185,27 +170,15 @@ def _order(first: Index, second: Index, weight: Index, absorbed: Index, rank: In
                 elif mark[e] > 0:
                     mark[e] = degree[e] + stamp + weight[i]
         mark[pivot] = stamp  # alive; not in any list yet
-        for p in range(free, end):
-            i = work[p]
-            outside = _renew_lists(i, pivot, stamp, begin, length, elements, weight, mark, work)
-            if outside == 0:  # sees nothing but L_p
-                absorbed[i] = pivot
-                size += weight[i]
-                left += weight[i]
-                weight[i] = length[i] = elements[i] = 0
-                continue
-            degree[i] = min(degree[i], outside)
-            total_code = 0
-            for q in range(begin[i], begin[i] + length[i]):
-                total_code += work[q]
-            code[i] = total_code % n
-            twin[i] = bucket[code[i]]
-            bucket[code[i]] = i
-        stamp += total + 1
+        gone = _renew_lists(
+            pivot, free, end, stamp, begin, length, elements, weight, degree, mark, work, absorbed
+        )
+        size -= gone
+        left -= gone
         stamp = _merge_twins(
             free,
             end,
-            stamp,
+            stamp + total + 1,
             begin,
             length,
             elements,
@@ -222,9 +195,12 @@ def _order(first: Index, second: Index, weight: Index, absorbed: Index, rank: In
             i = work[p]
             if weight[i] < 0:
                 weight[i] = -weight[i]
-                degree[i] = min(degree[i] + size, left) - weight[i]
-                _put_in(i, degree[i], head, after, before)
-                least = min(least, degree[i])
+                d = min(degree[i] + size, left) - weight[i]
+                after[i], before[i], degree[i] = head[d], -1, d
+                if head[d] >= 0:
+                    before[head[d]] = i
+                head[d] = i
+                least = min(least, d)
                 work[filled] = i
                 filled += 1
         begin[pivot], length[pivot], elements[pivot], degree[pivot] = free, filled - free, 0, size
@@ -260,57 +236,76 @@ def _form_element(
             start, stop = first + count, first + length[pivot]
         for p in range(start, stop):
             i = work[p]
-            if weight[i] > 0:
-                _take_out(i, degree[i], head, after, before)
-                size += weight[i]
-                weight[i] = -weight[i]
-                work[end] = i
-                end += 1
+            if weight[i] <= 0:
+                continue
+            size += weight[i]
+            weight[i] = -weight[i]
+            work[end] = i
+            end += 1
+            if after[i] >= 0:  # its degree will be another
+                before[after[i]] = before[i]
+            if before[i] >= 0:
+                after[before[i]] = after[i]
+            else:
+                head[degree[i]] = after[i]
     length[pivot] = end - free
     return size
 
 
 @kernel
 def _renew_lists(
-    i: int,
     pivot: int,
+    free: int,
+    end: int,
     stamp: int,
     begin: Index,
     length: Index,
     elements: Index,
     weight: Index,
+    degree: Index,
     mark: Index,
     work: Index,
+    absorbed: Index,
 ) -> int:
-    """Drop from E_i and A_i what L_p covers, put p first; return |A_i| + Σ |L_e \\ L_p|.
+    """Drop from E_i and A_i of all i in L_p what L_p covers, put p first, bound the degrees.
 
-    There is room for p: it replaces itself among the variables, or an element it absorbed.
+    Writes |A_i| + Σ |L_e \\ L_p| if that is less than the degree before. There is room for p: it
+    replaces itself among the variables, or an element it absorbed. Returns the weight of variables
+    that see nothing but L_p, which are eliminated with p.
     """
-    first, count = begin[i], elements[i]
-    outside, end = 0, first
-    for q in range(first, first + count):
-        e = work[q]
-        if mark[e] > stamp:
-            outside += mark[e] - stamp
-            work[end] = e
-            end += 1
-        else:  # inside L_p, or absorbed before
-            mark[e] = 0
-    kept = end - first
-    for q in range(first + count, first + length[i]):
-        j = work[q]
-        if weight[j] > 0:
-            outside += weight[j]
-            work[end] = j
-            end += 1
-    # p becomes the first element, the first element the last, the first variable goes to the end.
-    if end > first + kept:
-        work[end] = work[first + kept]
-    if kept > 0:
-        work[first + kept] = work[first]
-    work[first] = pivot
-    elements[i], length[i] = kept + 1, end + 1 - first
-    return outside
+    gone = 0
+    for s in range(free, end):
+        i = work[s]
+        first, outside = begin[i], 0
+        to = first
+        for q in range(first, first + elements[i]):
+            e = work[q]
+            if mark[e] > stamp:
+                outside += mark[e] - stamp
+                work[to] = e
+                to += 1
+            else:  # inside L_p, or absorbed before
+                mark[e] = 0
+        kept = to - first
+        for q in range(first + elements[i], first + length[i]):
+            j = work[q]
+            if weight[j] > 0:
+                outside += weight[j]
+                work[to] = j
+                to += 1
+        if outside == 0:
+            absorbed[i] = pivot
+            gone -= weight[i]
+            weight[i] = length[i] = elements[i] = 0
+            continue
+        # p becomes the first element, that one the last, the first variable goes to the end.
+        if to > first + kept:
+            work[to] = work[first + kept]
+        if kept > 0:
+            work[first + kept] = work[first]
+        work[first] = pivot
+        elements[i], length[i], degree[i] = kept + 1, to + 1 - first, min(degree[i], outside)
+    return gone
 
 
 @kernel
@@ -330,6 +325,15 @@ def _merge_twins(
     absorbed: Index,
 ) -> int:
     """Make one variable of all variables of L_p that have equal lists; return the next stamp."""
+    for p in range(free, end):
+        i = work[p]
+        if weight[i] < 0:
+            total = 0
+            for q in range(begin[i], begin[i] + length[i]):
+                total += work[q]
+            code[i] = total % len(bucket)
+            twin[i] = bucket[code[i]]
+            bucket[code[i]] = i
     for p in range(free, end):
         i = work[p]
         if weight[i] == 0:

@@ -88,7 +88,8 @@ def analyse(pattern: BlockPattern, order: Index) -> Fronts:
     post = _postorder(parent)
     order, parent = order[post], _renumbered(parent, post)
     start, lower = _lower_neighbours(_inverse(order), first, second)
-    front, front_parent = _supernodes(start, lower, parent, sizes[order])
+    below = _rows_below(start, lower, parent, sizes[order])
+    front, front_parent = _supernodes(parent, sizes[order], below)
     post = _postorder(front_parent)
     front, front_parent = _inverse(post)[front], _renumbered(front_parent, post)
     within = np.argsort(front, kind="stable")
@@ -108,7 +109,16 @@ def _plan(pattern: BlockPattern, order: Index, front: Index, parent: Index) -> F
     factor_start = _starts(np.diff(pivot) * width)
     run, runs = _runs(parent, pivot, border, border_rows)
     entry, entries = _entries(
-        pattern, position, front, scalar, pivot, border, border_rows, width, factor_start
+        (pattern.sizes, pattern.first, pattern.second),
+        (pattern.diagonal_start, pattern.pair_start, np.zeros(count + 1, np.int64)),
+        position,
+        front,
+        scalar,
+        pivot,
+        width,
+        factor_start,
+        border,
+        border_rows,
     )
     children = np.bincount(parent[parent >= 0], minlength=count)
     return Fronts(
@@ -126,33 +136,6 @@ def _plan(pattern: BlockPattern, order: Index, front: Index, parent: Index) -> F
         entry,
         entries,
     )
-
-
-def _entries(
-    pattern: BlockPattern,
-    position: Index,
-    front: Index,
-    scalar: Index,
-    pivot: Index,
-    border: Index,
-    border_rows: Index,
-    width: Index,
-    factor_start: Index,
-) -> tuple[Index, Index]:
-    """Return where each block of A goes in the factor, those of one front together."""
-    n = len(position)
-    i, j = np.append(np.arange(n), pattern.first), np.append(np.arange(n), pattern.second)
-    source = np.append(pattern.diagonal_start, pattern.pair_start)
-    low, high = np.minimum(position[i], position[j]), np.maximum(position[i], position[j])
-    owner = front[low]
-    within = np.argsort(owner, kind="stable")
-    owner, low, high = owner[within], low[within], high[within]
-    i, j, source = i[within], j[within], source[within]
-    column = _columns(owner, scalar[high], pivot, border, border_rows)
-    place = factor_start[owner] + (scalar[low] - pivot[owner]) * width[owner] + column
-    is_transposed = position[i] > position[j]
-    entries = np.column_stack([source, pattern.sizes[i], pattern.sizes[j], place, is_transposed])
-    return np.searchsorted(owner, np.arange(len(width) + 1)), entries
 
 
 def _inverse(permutation: Index) -> Index:
@@ -232,8 +215,8 @@ def _time(k: int, m: int) -> float:
 
 
 @kernel
-def _supernodes(start: Index, lower: Index, parent: Index, sizes: Index) -> tuple[Index, Index]:
-    """Return the front of each column of a postordered matrix, and the parent of each front."""
+def _rows_below(start: Index, lower: Index, parent: Index, sizes: Index) -> Index:
+    """Count the scalar rows that each column of L has below its diagonal block."""
     n = len(parent)
     below, mark = np.zeros(n, np.int64), np.full(n, -1)
     for i in range(n):
@@ -244,28 +227,25 @@ def _supernodes(start: Index, lower: Index, parent: Index, sizes: Index) -> tupl
                 mark[j] = i
                 below[j] += sizes[i]
                 j = parent[j]
+    return below
+
+
+@kernel
+def _supernodes(parent: Index, sizes: Index, below: Index) -> tuple[Index, Index]:
+    """Return the front of each column of a postordered matrix, and the parent of each front."""
+    n, count = len(parent), 0
     front, k, m = np.empty(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
-    above, count = np.full(n, -1), 0
     for j in range(n):
         if j == 0 or parent[j - 1] != j or below[j - 1] != below[j] + sizes[j]:
             count += 1
         front[j] = count - 1
         k[count - 1] += sizes[j]
         m[count - 1] = below[j]
+    above = np.full(count, -1)
     for j in range(n):
         if parent[j] >= 0 and front[parent[j]] != front[j]:
             above[front[j]] = front[parent[j]]
-    child, sibling = np.full(count, -1), np.full(count, -1)
-    merged = np.full(count, -1)
-    for s in range(count):
-        c = child[s]
-        while c >= 0:
-            if _time(k[c] + k[s], m[s]) < _time(k[c], m[c]) + _time(k[s], m[s]):
-                k[s] += k[c]
-                merged[c] = s
-            c = sibling[c]
-        if above[s] >= 0:
-            sibling[s], child[above[s]] = child[above[s]], s
+    merged = _merge(above, k, m)
     # Number what is left, in order; a merged front has the number of the one that took it.
     number, kept = np.empty(count, np.int64), 0
     for s in range(count):
@@ -281,6 +261,23 @@ def _supernodes(start: Index, lower: Index, parent: Index, sizes: Index) -> tupl
     for j in range(n):
         front[j] = number[front[j]]
     return front, up
+
+
+@kernel
+def _merge(above: Index, k: Index, m: Index) -> Index:
+    """Merge children into their parents where that saves time; return who took each, or −1."""
+    count = len(above)
+    child, sibling, merged = np.full(count, -1), np.full(count, -1), np.full(count, -1)
+    for s in range(count):
+        c = child[s]
+        while c >= 0:
+            if _time(k[c] + k[s], m[s]) < _time(k[c], m[c]) + _time(k[s], m[s]):
+                k[s] += k[c]
+                merged[c] = s
+            c = sibling[c]
+        if above[s] >= 0:
+            sibling[s], child[above[s]] = child[above[s]], s
+    return merged
 
 
 @kernel
@@ -318,23 +315,55 @@ def _borders(
 
 
 @kernel
-def _columns(owner: Index, row: Index, pivot: Index, border: Index, border_rows: Index) -> Index:
-    """Find the column of scalar row `row` in the front `owner`, by bisection in its border."""
-    column = np.empty(len(owner), np.int64)
-    for e in range(len(owner)):
-        s = owner[e]
-        if row[e] < pivot[s + 1]:
-            column[e] = row[e] - pivot[s]
-            continue
-        low, high = border[s], border[s + 1]
-        while low < high:
-            middle = (low + high) // 2
-            if border_rows[middle] < row[e]:
-                low = middle + 1
-            else:
-                high = middle
-        column[e] = pivot[s + 1] - pivot[s] + low - border[s]
-    return column
+def _entries(
+    where: tuple[Index, Index, Index],
+    starts: tuple[Index, Index, Index],
+    position: Index,
+    front: Index,
+    scalar: Index,
+    pivot: Index,
+    width: Index,
+    factor_start: Index,
+    border: Index,
+    border_rows: Index,
+) -> tuple[Index, Index]:
+    """List where each block of A goes in the factor, those of one front together.
+
+    `where` has sizes, first and second of the pattern, `starts` where a diagonal block and a pair
+    begin in `values`, and an array of the fronts' size plus one, all zeros, to be filled.
+    """
+    sizes, first, second = where
+    diagonal_start, pair_start, entry = starts
+    n, P = len(sizes), len(first)
+    entries = np.empty((n + P, 5), np.int64)
+    for e in range(-n, P):  # the diagonal blocks are the negative ones
+        i, j = (first[e], second[e]) if e >= 0 else (n + e, n + e)
+        entry[front[min(position[i], position[j])]] += 1
+    end = 0
+    for s in range(len(entry)):
+        end += entry[s]
+        entry[s] = end
+    for e in range(P - 1, -n - 1, -1):
+        i, j = (first[e], second[e]) if e >= 0 else (n + e, n + e)
+        low, high = min(position[i], position[j]), max(position[i], position[j])
+        s, row = front[low], scalar[high]
+        column = row - pivot[s]
+        if row >= pivot[s + 1]:  # by bisection in the border
+            b, beyond = border[s], border[s + 1]
+            while b < beyond:
+                middle = (b + beyond) // 2
+                if border_rows[middle] < row:
+                    b = middle + 1
+                else:
+                    beyond = middle
+            column = pivot[s + 1] - pivot[s] + b - border[s]
+        entry[s] -= 1
+        to = entry[s]
+        entries[to, 0] = pair_start[e] if e >= 0 else diagonal_start[n + e]
+        entries[to, 1], entries[to, 2] = sizes[i], sizes[j]
+        entries[to, 3] = factor_start[s] + (scalar[low] - pivot[s]) * width[s] + column
+        entries[to, 4] = position[i] > position[j]
+    return entry, entries
 
 
 @kernel
