@@ -90,8 +90,8 @@ class Account:
     history: tuple[IterationRecord, ...]
 
 
-def state_of(problem: Adjustment) -> State:
-    """Return the start of a problem.
+def state_of(problem: Adjustment, layout: Layout) -> State:
+    """Return the start of a problem, its points as they are laid out.
 
     Raises:
         InputError: a row of the intrinsics is of no lens.
@@ -102,7 +102,7 @@ def state_of(problem: Adjustment) -> State:
         name = problem.models[row]
         raise InputError(f"adjustment: intrinsics: row {row} has numbers that no {name} lens has")
     R, t = Ts[:, :3, :3].copy(), Ts[:, :3, 3].copy()
-    return State(Views(R, t, problem.lens.copy()), lenses, problem.points_world.copy())
+    return State(Views(R, t, problem.lens.copy()), lenses, problem.points_world[layout.point_order])
 
 
 def room_for(layout: Layout, num_views: int) -> System:

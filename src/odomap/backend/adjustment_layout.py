@@ -81,9 +81,14 @@ class Incidences(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """All of it; `order` (N,) says which observation of the problem each sorted one is."""
+    """All of it.
+
+    order (N,) and point_order (M,) say which observations and points of the problem those laid out
+    are: points that the same views see are near each other.
+    """
 
     order: Index
+    point_order: Index
     seen: Seen
     blocks: Blocks
     incidences: Incidences
@@ -103,11 +108,12 @@ def lay_out(problem: Adjustment, is_held_view: Mask | None = None) -> Layout:
     """
     blocks, is_joined = _blocks(problem, is_held_view)
     n, m = problem.num_observations, problem.num_points
+    point_order, rank = _by_first_view(problem)
     by_view, _ = _sorted_by(problem.view, problem.num_views)
-    by_point, start = _sorted_by(problem.point[by_view], m)
+    by_point, start = _sorted_by(rank[problem.point[by_view]], m)
     order = by_view[by_point]
     view = problem.view[order]
-    is_free_point = ~problem.is_fixed_point & (np.diff(start) > 0)
+    is_free_point = ~problem.is_fixed_point[point_order] & (np.diff(start) > 0)
     seen = Seen(start, view, problem.pixels[order], problem.weights[order], *_no_indices(n, n))
     touched, point = _no_indices(2 * n, 2 * n)
     first = np.zeros(m + 1, np.int64)
@@ -117,7 +123,17 @@ def lay_out(problem: Adjustment, is_held_view: Mask | None = None) -> Layout:
     by_block, block_start = _sorted_by(touched, len(blocks.size))
     slabs = _starts(3 * blocks.size[touched])
     incidences = Incidences(first, touched, point, slabs, by_block, block_start)
-    return Layout(order, seen, blocks, incidences, is_free_point, is_joined)
+    return Layout(order, point_order, seen, blocks, incidences, is_free_point, is_joined)
+
+
+def _by_first_view(problem: Adjustment) -> tuple[Index, Index]:
+    """Return points sorted by the first view that saw them, and the place of each."""
+    first = np.full(problem.num_points, problem.num_views - 1)
+    _lowest(problem.point, problem.view, first)
+    order, _ = _sorted_by(first, problem.num_views)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return order, rank
 
 
 def _blocks(problem: Adjustment, is_held_view: Mask | None) -> tuple[Blocks, bool]:
@@ -132,8 +148,8 @@ def _blocks(problem: Adjustment, is_held_view: Mask | None) -> tuple[Blocks, boo
         and not (is_free & is_shared).any()
         and POSE + width[is_free].max() <= MAX_BLOCK
     )
-    beside = is_free[lens] & is_joined
-    has_block = moves.any(axis=1) | beside
+    beside = np.asarray(is_free[lens] & is_joined)
+    has_block = np.asarray(moves.any(axis=1) | beside)
     pose = np.where(has_block, np.cumsum(has_block) - 1, -1)
     size = (POSE + np.where(beside, width[lens], 0))[has_block]
     of_lens = np.full(len(free), -1)
@@ -198,6 +214,13 @@ def _counting_sort(key: Index, order: Index, start: Index) -> None:
     for k in range(len(start) - 1, 0, -1):
         start[k] = start[k - 1]
     start[0] = 0
+
+
+@kernel
+def _lowest(point: Index, view: Index, first: Index) -> None:
+    """first[m] = the lowest view that saw point m."""
+    for o in range(len(point)):
+        first[point[o]] = min(first[point[o]], view[o])
 
 
 @kernel

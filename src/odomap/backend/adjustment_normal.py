@@ -176,6 +176,13 @@ def _whiten_slab(L: Array, m: int, size: int, V: Array, at: int) -> None:
 
 
 @kernel
+def _clear(values: Array) -> None:
+    """Write zeros: assigning to a slice takes a second to compile."""
+    for i in range(len(values)):
+        values[i] = 0.0
+
+
+@kernel
 def linearise(
     views: Views,
     lenses: LensArrays,
@@ -197,11 +204,13 @@ def linearise(
     first, touched, _, slab_at, _, _ = incidences
     scale, A, coupling, a, V, L, y, c, d = system
     D, J, C = np.zeros((2, 16)), np.zeros((2, POINT + 3)), np.empty(6)
-    A[:], a[:], coupling[:] = 0.0, 0.0, 0.0
+    _clear(A)
+    _clear(a)
+    _clear(coupling.reshape(-1))
     for m in range(len(points)):
         for j in range(slab_at[first[m]], slab_at[first[m + 1]]):
             V[j] = 0.0
-        C[:] = 0.0
+        _clear(C)
         c[m, 0], c[m, 1], c[m, 2] = 0.0, 0.0, 0.0
         p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
         for o in range(start[m], start[m + 1]):

@@ -168,8 +168,9 @@ def refine_points(
             elif attempt == 2:
                 x = retract(R, t, of_view[start[m]], p, step)
             cost, away = 0.0, 0
-            C[:] = 0.0
-            c[:] = 0.0
+            for j in range(6):
+                C[j] = 0.0
+            c[0], c[1], c[2] = 0.0, 0.0, 0.0
             for o in range(start[m], start[m + 1]):
                 i = of_view[o]
                 q = lens[i]

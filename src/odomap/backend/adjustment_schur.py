@@ -44,21 +44,21 @@ def pattern_of(layout: Layout, lens: Index) -> BlockPattern:
     mark[:] = -1
     _neighbours(incidences, partner, mark, row_start, second)
     first = np.repeat(np.arange(count), np.diff(row_start))
-    return BlockPattern(blocks.size, first, second)
+    key = np.sort(first * count + second)
+    return BlockPattern(blocks.size, key // max(count, 1), key % max(count, 1))
 
 
 @kernel
 def _neighbours(
     incidences: Incidences, partner: Index, mark: Index, row_start: Index, second: Index
 ) -> int:
-    """List the blocks j > i that share a point with block i, sorted; only count into an empty list.
+    """List the blocks j > i that share a point with block i; only count into an empty list.
 
     row_start[i]: where the list of i begins. Returns how many there are.
     """
     total = 0
     for i in range(len(partner)):
         row_start[i] = total
-        here = total
         if partner[i] >= 0:
             mark[partner[i]] = i
             if len(second):
@@ -73,8 +73,6 @@ def _neighbours(
                     if len(second):
                         second[total] = j
                     total += 1
-        if len(second):
-            second[here:total].sort()
     row_start[len(partner)] = total
     return total
 
