@@ -32,3 +32,7 @@ def test_the_same_twice():
     values = np.random.default_rng(0).normal(size=300)
     one, two = (largest_eigenvalue(lambda x: values * x, 300) for _ in range(2))
     assert one == two
+
+
+def test_what_multiplies_may_return_what_it_was_given():
+    assert largest_eigenvalue(lambda x: x, 6) == pytest.approx(1.0, rel=1e-14)

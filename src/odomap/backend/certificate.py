@@ -269,7 +269,7 @@ class _Matrix:
     def decrease(self, factor: BlockCholesky) -> float:
         """Return tr(G S⁻¹ Gᵀ), what the step X − G S⁻¹ takes off tr(X S Xᵀ)."""
         rows = np.ascontiguousarray(np.moveaxis(self.gradient, 1, 0)).reshape(self.space, -1)
-        return float(sum(row @ factor.solve(row) for row in rows))
+        return float(sum(np.sum(row * factor.solve(row)) for row in rows))
 
 
 @kernel

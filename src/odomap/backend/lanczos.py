@@ -21,7 +21,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["largest_eigenvalue"]
+from odomap.kernels import kernel
+
+__all__ = ["largest_eigenvalue", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -47,22 +49,48 @@ def largest_eigenvalue(
         7.0
     """
     steps = min(max_steps, size)
-    basis = np.zeros((steps + 1, size))
+    basis = np.zeros((steps, size))
     alpha, beta = np.zeros(steps), np.zeros(steps)
-    start = np.random.default_rng(seed).standard_normal(size)
-    basis[0] = start / np.linalg.norm(start)
+    y = np.random.default_rng(seed).standard_normal(size)
+    length = float(np.sqrt(np.sum(y * y)))
     value = 0.0
     for k in range(steps):
-        y = multiply(basis[k])
-        alpha[k] = y @ basis[k]
-        for _ in range(2):
-            y -= basis[: k + 1].T @ (basis[: k + 1] @ y)
-        beta[k] = np.linalg.norm(y)
+        _append(basis, k, y, length)
+        y = np.array(multiply(basis[k]))  # a copy: it is written to
+        alpha[k] = _orthogonalize(basis, k + 1, y)
+        beta[k] = length = float(np.sqrt(np.sum(y * y)))
         values, vectors = np.linalg.eigh(
             np.diag(alpha[: k + 1]) + np.diag(beta[:k], 1) + np.diag(beta[:k], -1)
         )
         value = float(values[-1])
-        if beta[k] * abs(vectors[-1, -1]) <= tolerance * abs(value):
+        if length * abs(vectors[-1, -1]) <= tolerance * abs(value):
             break
-        basis[k + 1] = y / beta[k]
     return value
+
+
+@kernel
+def _append(basis: Array, row: int, y: Array, length: float) -> None:
+    """basis_row = y / length."""
+    for i in range(len(y)):
+        basis[row, i] = y[i] / length
+
+
+@kernel(reorder=True)
+def _orthogonalize(basis: Array, count: int, y: Array) -> float:
+    """y −= Σ_k q_k (q_kᵀ y), newest first, twice; returns the first q_kᵀ y, Lanczos' α."""
+    alpha = 0.0
+    for sweep in range(2):
+        for k in range(count - 1, -1, -1):
+            dot = 0.0
+            for i in range(len(y)):
+                dot += basis[k, i] * y[i]
+            for i in range(len(y)):
+                y[i] -= dot * basis[k, i]
+            if sweep == 0 and k == count - 1:
+                alpha = dot
+    return alpha
+
+
+def warm_up() -> None:
+    """Compile the kernels of this module."""
+    largest_eigenvalue(lambda x: x, 2)
