@@ -35,6 +35,8 @@ __all__ = ["Marginals", "joint_covariance", "marginal_blocks", "warm_up"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+PANEL = 32  # pivots whose rows of the inverse are found together
+
 U = np.uint64
 
 
@@ -218,18 +220,15 @@ def _selected_inverse(factor: BlockCholesky) -> Array:
     """Return the pivot rows of all fronts of Z = A⁻¹, laid out as the factor; Z11 is full."""
     fronts = factor.fronts
     place, size = _places(fronts)
-    k, f = np.diff(fronts.pivot), fronts.width
-    m = f - k
-    widest, tallest = int(f.max(initial=0)), int(k.max(initial=0))
-    rows = int((k * m).max(initial=0)) + SLACK_ROWS * (widest + 1)
+    widest = int(fronts.width.max(initial=0))
     inverse = np.empty(int(fronts.start[-1]))
     _invert_fronts(
         fronts,
         factor.values,
         place,
         np.empty(size),
-        np.empty((3, rows + SLACK_ROWS * (tallest + 1))),
-        np.empty(tallest * tallest),
+        np.empty((3, (PANEL + SLACK_ROWS) * (widest + SLACK_ROWS))),
+        np.empty(PANEL * PANEL),
         np.empty(4 * TILE),
         inverse,
     )
@@ -267,8 +266,11 @@ def _invert_fronts(
         if above >= 0:
             to = at + k * (f + 1)
             _take_border(runs, run[s], run[s + 1], stack, place[above], width[above], to, f)
-        _border_rows(factor, start, k, f, stack, at, W, W_T, Z, tile)
-        _pivot_block(factor, start, k, f, stack, at, W, Z, corner)
+        for end in range(k, 0, -PANEL):  # what is behind the panel is its border
+            first = max(end - PANEL, 0)
+            skip, p, m = first * (f + 1), end - first, f - end
+            _border_rows(factor, start + skip, p, m, f, stack, at + skip, W, W_T, Z, tile)
+            _pivot_block(factor, start + skip, p, m, f, stack, at + skip, W, Z, corner)
         for i in range(k * f):
             inverse[U(start + i)] = stack[U(at + i)]
 
@@ -294,6 +296,7 @@ def _border_rows(
     factor: Array,
     start: int,
     k: int,
+    m: int,
     f: int,
     stack: Array,
     place: int,
@@ -302,8 +305,8 @@ def _border_rows(
     Z: Array,
     tile: Array,
 ) -> None:
-    """W = U11⁻¹ U12 and Z12 = −W Z22, k x m each; Z12 and its transpose go into the front."""
-    m, edge = f - k, np.int64(0)
+    """W = U11⁻¹ U12 and Z12 = −W Z22, k x m each, in fronts whose rows are f apart."""
+    edge = np.int64(0)
     for p in range(k - 1, -1, -1):
         row = start + p * f
         for j in range(m):
@@ -339,6 +342,7 @@ def _pivot_block(
     factor: Array,
     start: int,
     k: int,
+    m: int,
     f: int,
     stack: Array,
     place: int,
@@ -347,7 +351,6 @@ def _pivot_block(
     V: Array,
 ) -> None:
     """Z11 = V Vᵀ − W Z12ᵀ with V = U11⁻¹, k x k."""
-    m = f - k
     for p in range(k - 1, -1, -1):
         row = start + p * f
         for j in range(k - p):
