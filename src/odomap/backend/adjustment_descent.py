@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.adjustment_layout import Layout
+from odomap.backend.adjustment_layout import Layout, lay_out
 from odomap.backend.adjustment_lenses import LensArrays, lens_arrays, reaches
 from odomap.backend.adjustment_normal import (
     System,
@@ -38,7 +38,7 @@ from odomap.errors import InputError
 from odomap.geometry.robust import Loss
 from odomap.geometry.robust_kernels import loss_code
 
-__all__ = ["Account", "Criteria", "Descent", "State", "room_for", "state_of"]
+__all__ = ["Account", "Criteria", "Descent", "State", "chi2_of", "room_for", "state_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -120,6 +120,17 @@ def room_for(layout: Layout, num_views: int) -> System:
         np.zeros((m, 3)),
         np.zeros((m, 3)),
     )
+
+
+def chi2_of(problem: Adjustment) -> Array:
+    """Return the squared residuals (N,) of a problem in standard deviations; infinite unseen."""
+    layout = lay_out(problem)
+    laid, costs = np.empty(problem.num_observations), np.empty(problem.num_points)
+    state = state_of(problem, layout)
+    robust_cost(*state, layout.seen, loss_code(Loss()), 0.0, laid, costs)
+    chi2 = np.empty_like(laid)
+    chi2[layout.order] = laid
+    return chi2
 
 
 class Descent:
@@ -240,6 +251,9 @@ class Descent:
                 progress(history[-1])
 
         record(0.0)
+        if not np.isfinite(before):
+            reason = "the cost is not finite at the start"
+            return Account(before, before, 0, False, reason, self._unsorted(), tuple(history))
         damping, growth = criteria.damping, 2.0
         reason, converged = f"{criteria.iterations} iterations were spent", False
         for _ in range(criteria.iterations):
@@ -265,10 +279,13 @@ class Descent:
                 reason = "no step lowers the cost"
                 break
         self.cost, self.lost = self.evaluate(self.state)
+        chi2, spent = self._unsorted(), len(history) - 1
+        return Account(before, self.cost, spent, converged, reason, chi2, tuple(history))
+
+    def _unsorted(self) -> Array:
         chi2 = np.empty_like(self.chi2)
         chi2[self.layout.order] = self.chi2
-        spent = len(history) - 1
-        return Account(before, self.cost, spent, converged, reason, chi2, tuple(history))
+        return chi2
 
     def _set_scale(self) -> None:
         """Scale the unknowns by the curvature at the start."""

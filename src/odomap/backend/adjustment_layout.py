@@ -141,7 +141,7 @@ def _blocks(problem: Adjustment, is_held_view: Mask | None) -> tuple[Blocks, boo
     moves = _moving(problem, is_held_view)
     is_still = ~moves
     free, width = _free_numbers(problem)
-    is_free, lens = free.any(axis=1), problem.lens
+    is_free, lens = np.asarray(free.any(axis=1)), problem.lens
     is_shared = np.bincount(lens, minlength=len(free)) > 1
     is_joined = bool(
         is_free.any()

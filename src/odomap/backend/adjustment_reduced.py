@@ -24,13 +24,14 @@ from odomap.backend.adjustment_normal import System
 from odomap.backend.adjustment_schur import (
     add_couplings,
     damped_diagonal,
+    num_pairs,
     pattern_of,
     reduced_matrix,
 )
 from odomap.backend.blockcholesky import BlockCholesky
 from odomap.errors import InputError
 
-__all__ = ["METHODS", "Factored", "Iterative", "Method", "Reduced", "reduced_solver"]
+__all__ = ["METHODS", "Factored", "Iterative", "Method", "Pointwise", "Reduced", "reduced_solver"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -51,8 +52,8 @@ class Reduced(Protocol):
     """What solves the reduced system."""
 
     @property
-    def inner(self) -> int:
-        """How many products or factorisations the last step took."""
+    def name(self) -> str:
+        """What it is called in a solution."""
         ...
 
     def step(self, system: System, damping: float, stopped: Callable[[], bool]) -> Array | None:
@@ -60,14 +61,25 @@ class Reduced(Protocol):
         ...
 
 
+class Pointwise:
+    """Where only points are free there is nothing to solve."""
+
+    name = "points"
+
+    def step(self, system: System, damping: float, stopped: Callable[[], bool]) -> Array | None:
+        """Return δ (0,)."""
+        return np.zeros(0)
+
+
 class Factored:
     """Makes S and factors it."""
+
+    name = "factored"
 
     def __init__(self, layout: Layout, lens: Index) -> None:
         self.layout, self.lens = layout, lens
         self.pattern = pattern_of(layout, lens)
         self.factor = BlockCholesky(self.pattern)
-        self.inner = 1
         blocks = layout.blocks
         self._values = np.empty(self.pattern.num_values)
         self._s = np.empty(self.pattern.size)
@@ -108,6 +120,8 @@ class Factored:
 class Iterative:
     """Conjugate gradients, preconditioned by the diagonal blocks of S."""
 
+    name = "iterative"
+
     def __init__(self, layout: Layout, lens: Index, steps: int, eta: float) -> None:
         self.layout, self.lens, self.steps, self.eta = layout, lens, steps, eta
         self.inner = 0
@@ -145,9 +159,7 @@ class Iterative:
         return self._state.x.copy()
 
 
-def reduced_solver(
-    layout: Layout, lens: Index, method: Method, steps: int, eta: float
-) -> Factored | Iterative:
+def reduced_solver(layout: Layout, lens: Index, method: Method, steps: int, eta: float) -> Reduced:
     """Return what solves the reduced system of a problem.
 
     Args:
@@ -159,11 +171,18 @@ def reduced_solver(
     """
     if method not in METHODS:
         raise InputError(f"adjust: method '{method}' is unknown, give {', '.join(METHODS)}")
-    if method == "iterative":
+    if len(layout.blocks.size) == 0:
+        return Pointwise()
+    product = 4.0 * float(layout.incidences.at[-1])
+    if method == "iterative" or (method == "auto" and _num_values(layout, lens) > MAX_NUMBERS):
         return Iterative(layout, lens, steps, eta)
     factored = Factored(layout, lens)
-    product = 4.0 * float(layout.incidences.at[-1])
     is_quick = factored.factor.flops <= FLOPS_PER_PRODUCT * SLOWER * product
     if method == "factored" or (is_quick and factored.factor.num_nonzeros <= MAX_NUMBERS):
         return factored
     return Iterative(layout, lens, steps, eta)
+
+
+def _num_values(layout: Layout, lens: Index) -> float:
+    """Return about how many numbers S has."""
+    return num_pairs(layout, lens) * float(np.mean(layout.blocks.size)) ** 2

@@ -19,7 +19,7 @@ from odomap.backend.adjustment_normal import System
 from odomap.backend.blocks import BlockPattern
 from odomap.kernels import kernel
 
-__all__ = ["add_couplings", "damped_diagonal", "pattern_of", "reduced_matrix"]
+__all__ = ["add_couplings", "damped_diagonal", "num_pairs", "pattern_of", "reduced_matrix"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,20 +32,33 @@ def pattern_of(layout: Layout, lens: Index) -> BlockPattern:
         layout: of the problem.
         lens: (K,) of each view; a pose and the lens it looks through always share a block.
     """
-    blocks, incidences = layout.blocks, layout.incidences
-    count = len(blocks.size)
-    partner = np.full(count, -1)
-    if not layout.is_joined:
-        partner[blocks.pose[blocks.pose >= 0]] = blocks.lens[lens[blocks.pose >= 0]]
-    row_start = np.zeros(count + 1, np.int64)
-    mark = np.full(count, -1)
-    total = _neighbours(incidences, partner, mark, row_start, np.empty(0, np.int64))
+    sizes, partner = layout.blocks.size, _partners(layout, lens)
+    count = len(sizes)
+    row_start, mark = np.zeros(count + 1, np.int64), np.full(count, -1)
+    total = _neighbours(layout.incidences, partner, mark, row_start, np.empty(0, np.int64))
     second = np.empty(total, np.int64)
     mark[:] = -1
-    _neighbours(incidences, partner, mark, row_start, second)
-    first = np.repeat(np.arange(count), np.diff(row_start))
-    key = np.sort(first * count + second)
-    return BlockPattern(blocks.size, key // max(count, 1), key % max(count, 1))
+    _neighbours(layout.incidences, partner, mark, row_start, second)
+    key = np.sort(np.repeat(np.arange(count), np.diff(row_start)) * count + second)
+    return BlockPattern(sizes, key // max(count, 1), key % max(count, 1))
+
+
+def num_pairs(layout: Layout, lens: Index) -> int:
+    """Return how many blocks the reduced matrix has above its diagonal, before it is made."""
+    count = len(layout.blocks.size)
+    row_start, mark = np.zeros(count + 1, np.int64), np.full(count, -1)
+    nowhere = np.empty(0, np.int64)
+    return _neighbours(layout.incidences, _partners(layout, lens), mark, row_start, nowhere)
+
+
+def _partners(layout: Layout, lens: Index) -> Index:
+    """Return the block of the lens each pose looks through, -1 for none or its own."""
+    blocks = layout.blocks
+    partner = np.full(len(blocks.size), -1)
+    if not layout.is_joined:
+        is_block = blocks.pose >= 0
+        partner[blocks.pose[is_block]] = blocks.lens[lens[is_block]]
+    return partner
 
 
 @kernel
