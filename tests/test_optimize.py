@@ -217,7 +217,7 @@ def test_lines_passed_over_are_told(cli):
         (["ring.g2o", "--loss", "huber", "--width", "0"], "--width is 0: a positive number"),
         (["ring.g2o", "--certify", "--cost", "geodesic"], "the proof is of the chordal cost"),
         (["ring.g2o", "--certify", "--loss", "huber"], "no proof with a robust loss"),
-        (["ring.g2o", "--out", "ring.g2o"], "ring.g2o: is the graph itself"),
+        (["ring.g2o", "--out", "ring.g2o"], "ring.g2o: is the input itself"),
         (["ring.g2o", "--plot", "a.pdf"], "--plot a.pdf: only PNG is drawn"),
         (["ring.g2o", "--max-iterations", "-1"], "iterations"),
         (["edges.g2o", "--initial", "given"], "edges.g2o: solve: initial 'given' asks for poses"),

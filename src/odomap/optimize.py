@@ -10,7 +10,7 @@ relative to another.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from odomap.backend.posegraph import PoseGraph
 from odomap.errors import InputError
-from odomap.files.atomic import make_folder, write_bytes
+from odomap.files.atomic import write_bytes
 from odomap.files.graphs import GraphFile, check_graph_file, read_graph_file, write_graph
+from odomap.solving import Tell, check_out, compile_imported
 
 if TYPE_CHECKING:
     from odomap.backend.certificate import Certificate
@@ -29,9 +30,7 @@ if TYPE_CHECKING:
     from odomap.backend.solve import Cost, Initial, Solution
     from odomap.geometry.robust import Loss
 
-__all__ = ["OptimizeResult", "compiled", "optimize", "picture_beside"]
-
-Tell = Callable[[int, int, str], None]
+__all__ = ["OptimizeResult", "optimize", "picture_beside"]
 
 
 @dataclass(frozen=True)
@@ -107,9 +106,12 @@ def optimize(
     cost = _checked_cost(cost, loss, certify)
     config = SolverConfig(method=method, iterations=max_iterations)
     file = _opened(graph, skip_unknown)
-    _check_paths(graph, file.graph, out, picture)
+    for target in (out, picture):
+        check_out(graph, target)
+    if out is not None:
+        check_graph_file(out, file.graph)
     where = f"{graph}: " if isinstance(graph, str | Path) else ""
-    compiled(tell)
+    compile_imported(tell)
     tell(0, 0, f"{file.graph.num_nodes} poses, {file.graph.num_edges} edges")
     with deferred_interrupt() as interrupt:
         try:
@@ -139,20 +141,6 @@ def optimize(
     return OptimizeResult(
         solution, cost, certificate, sizes, file.skipped, seconds, is_interrupted, written
     )
-
-
-def compiled(tell: Tell) -> None:
-    """Compile, or load from the cache, the kernels of what is imported from the back-end."""
-    import sys
-
-    from odomap.kernels import modules_with_kernels, warm_up
-
-    imported = set(sys.modules)
-    rooms = ("odomap.backend.", "odomap.geometry.")
-    names = [n for n in modules_with_kernels() if n in imported and n.startswith(rooms)]
-    for index, name in enumerate(names):
-        tell(index, len(names), f"compiling {name}")
-        warm_up(name)
 
 
 def picture_beside(out: Path) -> Path:
@@ -186,19 +174,6 @@ def _opened(graph: str | Path | PoseGraph, skip_unknown: bool) -> GraphFile:
     if isinstance(graph, PoseGraph):
         return GraphFile(graph, "g2o", {})
     return read_graph_file(graph, skip_unknown)
-
-
-def _check_paths(given: str | Path | PoseGraph, graph: PoseGraph, *outs: str | Path | None) -> None:
-    """Make sure that results can be written, and that nothing is lost, before the work."""
-    for out in outs:
-        if out is None:
-            continue
-        file = Path(out)
-        if isinstance(given, str | Path) and file.exists() and file.samefile(given):
-            raise InputError(f"{file}: is the graph itself: choose another file with --out")
-        make_folder(file.parent)
-    if outs[0] is not None:
-        check_graph_file(outs[0], graph)
 
 
 def _write(

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
+from odomap.cli.bundle import Bundle
 from odomap.cli.calibrate import Calibrate
 from odomap.cli.config import ConfigVerb
 from odomap.cli.demo import Demo
@@ -31,6 +32,7 @@ VERBS: dict[str, Any] = {
     "calibrate": Calibrate,
     "eval": Evaluate,
     "optimize": Optimize,
+    "bundle": Bundle,
     "export": Export,
     "info": Info,
     "config": ConfigVerb,
