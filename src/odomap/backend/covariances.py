@@ -17,11 +17,10 @@ Reference: M. Kaess, F. Dellaert, "Covariance recovery from a square root inform
 data association", Robotics and Autonomous Systems 57(12), 2009.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from odomap.backend import marginals
 from odomap.backend.blockcholesky import BlockCholesky
 from odomap.backend.components import Components, find_components
 from odomap.backend.descent import Linear
@@ -113,7 +112,7 @@ class GraphCovariances:
         is_free = columns >= 0
         wanted, back = np.unique(columns[is_free], return_inverse=True)
         if len(wanted):
-            out[is_free] = marginal_blocks(self._factor, wanted)[back]
+            out[is_free] = marginals.marginal_blocks(self._factor, wanted)[back]
         return out
 
     def joint(self, i: int, j: int) -> Array:
@@ -125,7 +124,9 @@ class GraphCovariances:
         if len(free) == 2 and columns[0] == columns[1]:
             out[:] = self.marginals([i])[0][None, :, None, :]
         elif len(free):
-            found = joint_blocks(self._factor, columns[free]).reshape(len(free), k, len(free), k)
+            found = marginals.joint_covariance(self._factor, columns[free]).reshape(
+                len(free), k, len(free), k
+            )
             out[free[:, None], :, free] = found.transpose(0, 2, 1, 3)
         return out.reshape(2 * k, 2 * k)
 
@@ -201,18 +202,3 @@ def _undetermined(problem: GraphProblem) -> str:
         f"covariances: {name} is not determined by what was measured: does its information have "
         "a direction without weight?"
     )
-
-
-def marginal_blocks(factor: BlockCholesky, blocks: Index) -> Array:
-    """Return the diagonal blocks (K, s, s) of the inverse, of blocks of one size."""
-    return np.stack([joint_blocks(factor, [block]) for block in blocks])
-
-
-def joint_blocks(factor: BlockCholesky, blocks: Sequence[int] | Index) -> Array:
-    """Return the rows and columns of some blocks in the inverse."""
-    start, sizes = factor.pattern.row_start, factor.pattern.sizes
-    rows = np.concatenate([start[b] + np.arange(sizes[b]) for b in blocks])
-    units = np.zeros((factor.pattern.size, len(rows)))
-    units[rows, np.arange(len(rows))] = 1.0
-    found = factor.solve(units)[rows]
-    return np.asarray(0.5 * (found + found.T))

@@ -7,18 +7,19 @@ of cost c are within a fraction ε of the optimum as long as
     c  ≤  (1 + ε) b.
 
     node and its edge     placed by the edge, at no cost: nothing to solve
-    further edges         the nodes around them are solved, the rest held: a window of fixed size
-    c > (1 + ε) b         all is solved, from where it is; in most cases the windows have left
-                          nothing to gain, and one factorisation proves it and renews the bound
+    further edges         b rises by what their neighbourhood says they must cost (`innovation`);
+                          the nodes around them are solved, the rest held: a window of fixed size
+    c > (1 + ε) b         all is solved, from where it is, and the bound renewed; where the windows
+                          have left nothing to gain, one factorisation proves it
 
-A loop that brings news breaks the bound at once; one that agrees with the map does not, and n such
-loops raise the bound by a fraction of about 1/n each, so that larger maps are solved less often.
-Where the cost rises by more than noise explains, a chordal start is tried beside the present poses.
+A loop that brings news breaks the bound at once; one that agrees with the map does not. Where the
+cost rises by more than noise explains, a chordal start is tried beside the present poses.
 
-Cost: O(window) per addition, and the whole each time the cost has grown by ε.
+Cost: O(window) per addition, whatever the size of the graph, but for loops that move all of it.
 
-Reference: compare M. Kaess et al., "iSAM2", IJRR 31(2), 2012, which keeps the factor up to date
-instead; K. Konolige, M. Agrawal, "FrameSLAM", IEEE Transactions on Robotics 24(5), 2008 (windows).
+Reference: K. Konolige, M. Agrawal, "FrameSLAM: from bundle adjustment to real-time visual mapping",
+IEEE Transactions on Robotics 24(5), 2008 (windows); compare M. Kaess et al., "iSAM2", IJRR 31(2),
+2012, which keeps the factor of everything up to date instead.
 """
 
 from dataclasses import dataclass, replace
@@ -32,6 +33,8 @@ from odomap.backend.graphproblem import GraphProblem, GraphState
 from odomap.backend.growing import GrowingArray
 from odomap.backend.growinggraph import GrowingGraph
 from odomap.backend.initialization import chordal
+from odomap.backend.innovation import least_rise
+from odomap.backend.neighbourhood import Neighbourhood
 from odomap.backend.posegraph import Group, PoseGraph
 from odomap.backend.solve import Stop
 from odomap.errors import InputError
@@ -45,6 +48,8 @@ Index = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Scope = Literal["none", "placed", "window", "whole"]
 
+_RELIED_ON = 0.9
+"""Part of a rise found to first order that raises the bound."""
 _NOTHING = 1e-9
 """A cost that says nothing: half a squared deviation of no measurement."""
 
@@ -70,7 +75,8 @@ class UpdateRecord:
 
     Attributes:
         scope: "none", "placed" (nothing had to be solved), "window" or "whole".
-        cost: of all edges and priors at the poses now. bound: no poses have a lower one.
+        cost: of all edges and priors at the poses now.
+        bound: from below on the cost of any poses nearby.
         iterations: steps of the whole solution; 0 if what there was proved good enough.
         converged: whether the cost is within the tolerance.
         reason: why solving stopped, in words.
@@ -115,6 +121,7 @@ class IncrementalPoseGraph:
     ) -> None:
         self.config = IncrementalConfig() if config is None else config
         self.loss = Loss() if loss is None else loss
+        self._solver = SolverConfig(tolerance=self.config.tolerance / 8.0)
         self._graph = GrowingGraph(group)
         self._edge_cost, self._prior_cost = (GrowingArray((), np.float64) for _ in range(2))
         self._new_edges: list[int] = []
@@ -123,6 +130,7 @@ class IncrementalPoseGraph:
         self._moved: list[int] = []
         self._seeds: list[int] = []
         self._num_redundant = 0
+        self._num_solved = 0, 0
 
     def add_node(
         self,
@@ -182,7 +190,6 @@ class IncrementalPoseGraph:
         self._settle()
         if not self._seeds:
             return self._record("placed" if self._moved else "none", 0, True, "nothing to solve")
-        self._num_redundant += len(self._seeds)
         if len(self._seeds) <= self.config.window:
             self._solve_window()
             if self._cost <= self._limit:
@@ -236,6 +243,7 @@ class IncrementalPoseGraph:
             moved = graph.settle_prior(prior)
             self._moved += moved
             self._seeds += [] if moved else [graph.node_of_prior(prior)]
+            self._num_redundant += not moved
         self._new_priors.clear()
         while self._new_edges:
             waiting = [edge for edge in self._new_edges if not self._settle_edge(edge)]
@@ -256,6 +264,7 @@ class IncrementalPoseGraph:
         self._moved += moved
         if not moved:
             self._seeds += self._graph.nodes_of_edge(edge)
+            self._num_redundant += 1
         return True
 
     def _problem(self, graph: PoseGraph, is_held: Bool) -> GraphProblem:
@@ -272,6 +281,7 @@ class IncrementalPoseGraph:
         """Solve the nodes around what is new, the rest held."""
         seeds = list(dict.fromkeys(reversed(self._seeds)))
         graph, near, priors = self._graph.around(seeds, self.config.window)
+        self._bound += _RELIED_ON * self._rise(graph, near, priors)
         problem = self._problem(graph, np.arange(graph.num_nodes) >= near.num_inner)
         descent = descend(problem, _state(problem), self._solver)
         inner = near.nodes[: near.num_inner]
@@ -282,6 +292,18 @@ class IncrementalPoseGraph:
         for rows, which, now in (edges, (self._prior_cost.rows, priors, costs[len(near.edges) :])):
             self._cost += float(now.sum() - rows[which].sum())
             rows[which] = now
+
+    def _rise(self, graph: PoseGraph, near: Neighbourhood, priors: list[int]) -> float:
+        """Return by how much what is new around here raises the least cost at least."""
+        if self.loss.name != "quadratic":
+            return 0.0  # a loss that levels off is not bounded by its quadratic model
+        is_held = self._graph.is_held[near.nodes]
+        if not (is_held.any() or priors):
+            is_held[-1] = True
+        is_new = np.append(
+            near.edges >= self._num_solved[0], np.array(priors) >= self._num_solved[1]
+        )
+        return least_rise(self._problem(graph, is_held), is_new)
 
     def _solve_whole(self, stop: Stop | None) -> Descent[GraphState]:
         """Solve all nodes from where they are, and renew the bound."""
@@ -306,11 +328,6 @@ class IncrementalPoseGraph:
             self._num_redundant = 0
         return descent
 
-    @property
-    def _solver(self) -> SolverConfig:
-        """Return how to descend: until a step promises a fraction of what is tolerated."""
-        return SolverConfig(tolerance=self.config.tolerance / 8.0)
-
     def _costs(self, problem: GraphProblem, x: GraphState) -> Array:
         """Return the cost of each edge, and then of each prior."""
         problem.cost_of_edges(x)
@@ -321,6 +338,7 @@ class IncrementalPoseGraph:
 
     def _record(self, scope: Scope, iterations: int, converged: bool, reason: str) -> UpdateRecord:
         """Return what was done, and forget what was new."""
+        self._num_solved = self.num_edges, self._graph.num_priors
         moved = np.unique(np.array(self._moved, np.int64))
         self._moved, self._seeds = [], self._seeds if not converged else []
         ids = self._graph.ids[moved]
