@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.adjustment_covariance import ViewCovariance, view_covariance
 from odomap.backend.adjustment_descent import Criteria, Descent, chi2_of, state_of
-from odomap.backend.adjustment_gauge import Gauge, find_gauge
+from odomap.backend.adjustment_gauge import Gauge, bring_back, find_gauge
 from odomap.backend.adjustment_layout import Layout, lay_out
 from odomap.backend.adjustment_problem import Adjustment
 from odomap.backend.adjustment_reduced import Method, reduced_solver
@@ -58,7 +58,7 @@ class AdjustmentConfig:
     method: Method = "auto"
     """How views are solved for: auto, factored or iterative (conjugate gradients)."""
     gauge: Literal["free", "hold"] = "free"
-    """Whether the first view and the scale of each connected part are held where nothing is."""
+    """hold: the first view and the scale of parts that nothing holds come back to what they were."""
     iterations: Annotated[int, Limits(least=0)] = 100
     """Most steps tried."""
     tolerance: NotNegative = 1e-6
@@ -199,8 +199,8 @@ def _solve(
     """Solve without the outliers."""
     used = _without(problem, is_outlier) if is_outlier.any() else problem
     gauge = find_gauge(used)
-    layout = lay_out(used, gauge.is_held if config.gauge == "hold" else None)
-    surplus = _surplus(used, layout, gauge, config.gauge == "hold")
+    layout = lay_out(used)
+    surplus = _surplus(used, layout, gauge)
     reduced = reduced_solver(
         layout, used.lens, config.method, config.inner_iterations, config.inner_tolerance
     )
@@ -208,6 +208,8 @@ def _solve(
     criteria = Criteria(config.iterations, config.tolerance, config.damping)
     account = descent.run(criteria, stopped, progress)
     moved = _moved(problem, descent, layout)
+    if config.gauge == "hold":
+        moved = bring_back(problem, moved, gauge)
     chi2 = chi2_of(moved) if is_outlier.any() else account.chi2
     known = account.chi2[np.isfinite(account.chi2)]
     sees = np.bincount(used.view, minlength=used.num_views) > 0
@@ -242,14 +244,14 @@ def _without(problem: Adjustment, is_outlier: Mask) -> Adjustment:
     )
 
 
-def _surplus(problem: Adjustment, layout: Layout, gauge: Gauge, is_gauge_held: bool) -> int:
+def _surplus(problem: Adjustment, layout: Layout, gauge: Gauge) -> int:
     """Return how many more numbers were seen than are unknown; raise InputError if fewer."""
     free = int(np.count_nonzero(~layout.blocks.is_held))
     unknown = free + 3 * int(np.count_nonzero(layout.is_free_point))
     if unknown == 0:
         raise InputError("adjust: every view, point and lens that is seen is held: free some")
     rows = 2 * int(np.count_nonzero(problem.weights > 0.0))
-    surplus = rows - unknown + (0 if is_gauge_held else int(np.count_nonzero(gauge.is_held)))
+    surplus = rows - unknown + int(np.count_nonzero(gauge.is_held))
     if surplus < 0:
         raise InputError(
             f"adjust: {rows} numbers were seen, {unknown} are unknown: hold views, points or lenses"
