@@ -5,7 +5,8 @@
 Ceres is reached through pyceres; the cost functions are C++ too, COLMAP's automatically
 differentiated ones (pycolmap): its RADIAL model with the principal point held at zero is that of
 BAL, once y and z point the other way. Each configuration is tried once and the fastest again.
-Clocks are Ceres' own, from before it analyses the problem; building the problem is not in them.
+Clocks are Ceres' own and start after its preprocessor, whose seconds are noted beside; building the
+problem is not in them.
 Needs numpy, pyceres and pycolmap; odomap is not imported.
 """
 
@@ -104,10 +105,9 @@ class Ceres:
         options.callbacks = [note]
         summary = pyceres.SolverSummary()
         pyceres.solve(options, self.problem, summary)
-        before = summary.preprocessor_time_in_seconds
-        self.preprocessor_s = min(self.preprocessor_s, before)
+        self.preprocessor_s = min(self.preprocessor_s, summary.preprocessor_time_in_seconds)
         best = np.minimum.accumulate(costs).tolist()  # a refused step leaves the cost where it was
-        return Run([before + s for s in seconds], best, self.result())
+        return Run(seconds, best, self.result())
 
     def result(self) -> Array:
         """Return all that was found in one row: poses (K, 4, 4), points (M, 3), lenses (K, 3)."""
