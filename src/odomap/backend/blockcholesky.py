@@ -128,10 +128,10 @@ class BlockCholesky:
         local, visited = np.empty(self._widest * GROUP), np.arange(len(self.fronts.parent))
         for start in range(0, b.shape[1], GROUP):
             count = min(GROUP, b.shape[1] - start)
-            group = np.zeros((len(b), GROUP))
-            group[:, :count] = b[rows, start : start + count]
+            group = np.zeros((GROUP, len(b)))
+            group[:count] = b[rows, start : start + count].T
             solve_group(self.fronts, self.values, visited, group.reshape(-1), local)
-            x[rows, start : start + count] = group[:, :count]
+            x[rows, start : start + count] = group[:count].T
         return x
 
     def log_determinant(self) -> float:

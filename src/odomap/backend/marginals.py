@@ -1,22 +1,21 @@
 """Covariances from a factored information matrix: some blocks of A⁻¹, without forming A⁻¹.
 
 The covariance of a graph's solution is A⁻¹, which is dense. But its blocks in the pattern of the
-factor follow from each other: from A = Uᵀ U, Z = A⁻¹ obeys U Z = U⁻ᵀ, and with the rows of one
-front U = | U11 U12 | and Z22 the part of Z that belongs to the front's border,
+factor follow from each other, from the root of the elimination tree down (`selected`): one pass
+yields the covariance of every node and of every pair of neighbours.
 
-    W = U11⁻¹ U12,    Z12 = −W Z22,    Z11 = (U11ᵀ U11)⁻¹ − W Z12ᵀ.
+Blocks far from each other are found as columns of A⁻¹, by solving
 
-The border of a front lies within its parent's front, so going from the roots down, Z22 is always at
-hand: one pass yields the covariance of every node and of every pair of neighbours.
+    A X = E,    E the columns of the identity that belong to the chosen blocks.
 
-Blocks far from each other are columns of A⁻¹, A X = E. A column that is wanted in few places needs
-only the fronts on the ways from those places to the root, in both substitutions.
+Such a column is wanted in few places, and needs only the fronts on the ways from there to the root,
+in both substitutions: forwards nothing else is reached from E, backwards nothing else is asked for.
 
 Cost: two or three factorisations for all of them; for the joint covariance of a few blocks, 4
 operations for each entry of those fronts and each column.
 
-Reference: Erisman, Tinney, "On Computing Certain Elements of the Inverse of a Sparse Matrix",
-Communications of the ACM 18(3), 1975 (after Takahashi, Fagan, Chin, 1973).
+Reference: Kaess, Dellaert, "Covariance Recovery from a Square Root Information Matrix for Data
+Association", Robotics and Autonomous Systems 57(12), 2009.
 """
 
 import numpy as np
@@ -24,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from odomap.backend.blockcholesky import BlockCholesky
 from odomap.backend.blocks import BlockPattern
-from odomap.backend.fronts import SLACK_ROWS, TILE, take_off
 from odomap.backend.multifrontal import GROUP, solve_group
+from odomap.backend.selected import selected_inverse
 from odomap.backend.symbolic import Fronts
 from odomap.errors import InputError
 from odomap.kernels import kernel
@@ -34,10 +33,6 @@ __all__ = ["Marginals", "joint_covariance", "marginal_blocks", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-PANEL = 32  # pivots whose rows of the inverse are found together
-
-U = np.uint64
 
 
 class Marginals:
@@ -63,7 +58,7 @@ class Marginals:
     def __init__(self, factor: BlockCholesky) -> None:
         factor.require_factor()
         self.pattern, self._fronts = factor.pattern, factor.fronts
-        self._inverse = _selected_inverse(factor)
+        self._inverse = selected_inverse(factor.fronts, factor.values)
         self._position = np.empty_like(self._fronts.rows)
         self._position[self._fronts.rows] = np.arange(len(self._position))
 
@@ -160,10 +155,10 @@ def joint_covariance(factor: BlockCholesky, blocks: ArrayLike) -> Array:
     joint = np.empty((len(at), len(at)))
     for c in range(0, len(at), GROUP):
         count = min(GROUP, len(at) - c)
-        X = np.zeros((factor.pattern.size, GROUP))
-        X[at[c : c + count], np.arange(count)] = 1.0
+        X = np.zeros((GROUP, factor.pattern.size))
+        X[np.arange(count), at[c : c + count]] = 1.0
         solve_group(fronts, factor.values, visited, X.reshape(-1), local)
-        joint[:, c : c + count] = X[at, :count]
+        joint[:, c : c + count] = X[:count, at].T
     return 0.5 * (joint + joint.T)
 
 
@@ -214,163 +209,6 @@ def _entries_up(fronts: Fronts) -> Array:
         if fronts.parent[s] >= 0:
             entries[s] += entries[fronts.parent[s]]
     return entries
-
-
-def _selected_inverse(factor: BlockCholesky) -> Array:
-    """Return the pivot rows of all fronts of Z = A⁻¹, laid out as the factor; Z11 is full."""
-    fronts = factor.fronts
-    place, size = _places(fronts)
-    widest = int(fronts.width.max(initial=0))
-    inverse = np.empty(int(fronts.start[-1]))
-    _invert_fronts(
-        fronts,
-        factor.values,
-        place,
-        np.empty(size),
-        np.empty((3, (PANEL + SLACK_ROWS) * (widest + SLACK_ROWS))),
-        np.empty(PANEL * PANEL),
-        np.empty(4 * TILE),
-        inverse,
-    )
-    return inverse
-
-
-@kernel
-def _places(fronts: Fronts) -> tuple[Index, int]:
-    """Return where each f x f front of Z waits for its children: behind its parent's."""
-    place, size = np.zeros(len(fronts.parent), np.int64), 0
-    for s in range(len(fronts.parent) - 1, -1, -1):
-        above = fronts.parent[s]
-        if above >= 0:
-            place[s] = place[above] + fronts.width[above] ** 2
-        size = max(size, place[s] + fronts.width[s] ** 2)
-    return place, size
-
-
-@kernel(reorder=True)
-def _invert_fronts(
-    fronts: Fronts,
-    factor: Array,
-    place: Index,
-    stack: Array,
-    rows: Array,
-    corner: Array,
-    tile: Array,
-    inverse: Array,
-) -> None:
-    """Write Z of all fronts, from the roots down."""
-    pivot, width, parent, begin = fronts.pivot, fronts.width, fronts.parent, fronts.start
-    run, runs, W, W_T, Z = fronts.run, fronts.runs, rows[0], rows[1], rows[2]
-    for s in range(len(width) - 1, -1, -1):
-        k, f, start, at, above = pivot[s + 1] - pivot[s], width[s], begin[s], place[s], parent[s]
-        if above >= 0:
-            to = at + k * (f + 1)
-            _take_border(runs, run[s], run[s + 1], stack, place[above], width[above], to, f)
-        for end in range(k, 0, -PANEL):  # what is behind the panel is its border
-            first = max(end - PANEL, 0)
-            skip, p, m = first * (f + 1), end - first, f - end
-            _border_rows(factor, start + skip, p, m, f, stack, at + skip, W, W_T, Z, tile)
-            _pivot_block(factor, start + skip, p, m, f, stack, at + skip, W, Z, corner)
-        for i in range(k * f):
-            inverse[U(start + i)] = stack[U(at + i)]
-
-
-@kernel
-def _take_border(
-    runs: Index, first: int, last: int, stack: Array, source: int, g: int, to: int, f: int
-) -> None:
-    """Copy Z22 of a front from its parent's Z: rows of g there, of f here."""
-    for a in range(first, last):
-        for x in range(runs[a, 0]):
-            done = to
-            for b in range(first, last):
-                row = source + (runs[a, 1] + x) * g + runs[b, 1]
-                for j in range(runs[b, 0]):
-                    stack[U(done + j)] = stack[U(row + j)]
-                done += runs[b, 0]
-            to += f
-
-
-@kernel(reorder=True)
-def _border_rows(
-    factor: Array,
-    start: int,
-    k: int,
-    m: int,
-    f: int,
-    stack: Array,
-    place: int,
-    W: Array,
-    W_T: Array,
-    Z: Array,
-    tile: Array,
-) -> None:
-    """W = U11⁻¹ U12 and Z12 = −W Z22, k x m each, in fronts whose rows are f apart."""
-    edge = np.int64(0)
-    for p in range(k - 1, -1, -1):
-        row = start + p * f
-        for j in range(m):
-            W[U(p * m + j)] = factor[U(row + k + j)]
-        for q in range(p + 1, k):
-            u = factor[row + q]
-            for j in range(m):
-                W[U(p * m + j)] -= u * W[U(q * m + j)]
-        scale = 1.0 / factor[row + p]
-        for j in range(m):
-            W[U(p * m + j)] *= scale
-            W_T[j * k + p] = W[U(p * m + j)]
-    for i in range(m * k, (m + SLACK_ROWS) * k + SLACK_ROWS):
-        W_T[i] = 0.0
-    for i in range((k + SLACK_ROWS) * m):
-        Z[i] = 0.0
-    for a in range(0, m, 4):
-        for c in range(0, m, TILE):
-            width = min(TILE, m - c)
-            for q in range(4):
-                row = place + (k + a + q) * f + k + c
-                for j in range(width):
-                    tile[U(q * TILE + j)] = stack[U(row + j)] if a + q < m else 0.0
-            for r in range(0, k, 4):
-                take_off(Z, r * m + c, m, tile, edge, W_T, a * k + r, k, width)
-    for p in range(k):
-        for j in range(m):
-            stack[place + p * f + k + j] = stack[place + (k + j) * f + p] = Z[p * m + j]
-
-
-@kernel(reorder=True)
-def _pivot_block(
-    factor: Array,
-    start: int,
-    k: int,
-    m: int,
-    f: int,
-    stack: Array,
-    place: int,
-    W: Array,
-    Z: Array,
-    V: Array,
-) -> None:
-    """Z11 = V Vᵀ − W Z12ᵀ with V = U11⁻¹, k x k."""
-    for p in range(k - 1, -1, -1):
-        row = start + p * f
-        for j in range(k - p):
-            V[U(p * k + p + j)] = 0.0
-        V[p * k + p] = 1.0
-        for q in range(p + 1, k):
-            u = factor[row + q]
-            for j in range(k - q):
-                V[U(p * k + q + j)] -= u * V[U(q * k + q + j)]
-        scale = 1.0 / factor[row + p]
-        for j in range(k - p):
-            V[U(p * k + p + j)] *= scale
-    for p in range(k):
-        for r in range(p, k):
-            total = 0.0
-            for j in range(k - r):
-                total += V[U(p * k + r + j)] * V[U(r * k + r + j)]
-            for j in range(m):
-                total -= W[U(p * m + j)] * Z[U(r * m + j)]
-            stack[place + p * f + r] = stack[place + r * f + p] = total
 
 
 @kernel

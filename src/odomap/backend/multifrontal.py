@@ -10,7 +10,7 @@ All sparse indexing is done here, once for each entry of a border; the arithmeti
 `fronts`). Waiting updates are packed: row r holds its m − r entries from the diagonal on.
 
 With A = Uᵀ U, U y = x is solved from the last front to the first and Uᵀ y = b from the first to the
-last, each reading U once. Several right-hand sides go through in groups of eight.
+last, each reading U once. Several right-hand sides go through in groups of four.
 
 Cost: Σ over fronts of Σ_{p < k} (f − p)² for the factor, 4 operations an entry of U for a solution.
 
@@ -32,7 +32,7 @@ __all__ = ["GROUP", "factor_fronts", "solve_fronts", "solve_group", "stack_size"
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-GROUP = 8  # right-hand sides solved together
+GROUP = 4  # right-hand sides solved together, in `solve_group`
 
 U = np.uint64
 
@@ -65,7 +65,7 @@ def factor_fronts(
     pivot, width, begin, border = fronts.pivot, fronts.width, fronts.start, fronts.border
     entry, entries, run, runs = fronts.entry, fronts.entries, fronts.run, fronts.runs
     tile, diagonal = scratch[: 4 * TILE], scratch[4 * TILE :]
-    owner, top, end = np.empty(len(width) + 1, np.int64), 0, np.int64(0)
+    owner, top, end = np.empty(len(width) + 1, np.int64), 0, begin[0]
     for s in range(len(width)):
         k, f, start = pivot[s + 1] - pivot[s], width[s], begin[s]
         m, rest = f - k, end
@@ -173,50 +173,51 @@ def solve_fronts(fronts: Fronts, factor: Array, x: Array, local: Array) -> None:
 
 @kernel(reorder=True)
 def solve_group(fronts: Fronts, factor: Array, visited: Index, x: Array, local: Array) -> None:
-    """Do as `solve_fronts` with GROUP right-hand sides, x (n GROUP,) row-major.
+    """Do as `solve_fronts` with four right-hand sides, x (4 n,), one after the other.
 
     `visited` names the fronts that take part, ascending, and with each its parent. From right-hand
     sides that are zero in all others follow solutions that are right in these.
     """
     pivot, width, start, rows = fronts.pivot, fronts.width, fronts.start, fronts.border_rows
-    y = np.empty(GROUP)
+    n = len(fronts.rows)
     for s in visited:
         k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
-        for j in range(f * GROUP):
+        for j in range(4 * f):
             local[j] = 0.0
         for p in range(k):
-            row, at = start[s] + p * f, (first + p) * GROUP
-            scale = 1.0 / factor[row + p]
-            for g in range(GROUP):
-                y[g] = (x[at + g] - local[p * GROUP + g]) * scale
-                x[at + g] = y[g]
-            for j in range(p + 1, f):
-                u = factor[row + j]
-                for g in range(GROUP):
-                    local[U(j * GROUP + g)] += u * y[U(g)]
-        for j in range(k, f):
-            at = rows[border + j] * GROUP
-            for g in range(GROUP):
-                x[at + g] -= local[j * GROUP + g]
+            u, at, to = start[s] + p * f + p, first + p, p
+            scale = 1.0 / factor[u]
+            y0, y1 = (x[at] - local[to]) * scale, (x[at + n] - local[to + f]) * scale
+            y2 = (x[at + 2 * n] - local[to + 2 * f]) * scale
+            y3 = (x[at + 3 * n] - local[to + 3 * f]) * scale
+            x[at], x[at + n], x[at + 2 * n], x[at + 3 * n] = y0, y1, y2, y3
+            for j in range(1, f - p):
+                local[U(to + j)] += y0 * factor[U(u + j)]
+                local[U(to + f + j)] += y1 * factor[U(u + j)]
+                local[U(to + 2 * f + j)] += y2 * factor[U(u + j)]
+                local[U(to + 3 * f + j)] += y3 * factor[U(u + j)]
+        for g in range(4):
+            for j in range(k, f):
+                x[g * n + rows[border + j]] -= local[g * f + j]
     for s in visited[::-1]:
         k, f, first = pivot[s + 1] - pivot[s], width[s], pivot[s]
         border = fronts.border[s] - k
-        for j in range(k, f):
-            at = rows[border + j] * GROUP
-            for g in range(GROUP):
-                local[j * GROUP + g] = x[at + g]
+        for g in range(4):
+            for j in range(k, f):
+                local[g * f + j] = x[g * n + rows[border + j]]
         for p in range(k - 1, -1, -1):
-            row, at = start[s] + p * f, (first + p) * GROUP
-            for g in range(GROUP):
-                y[g] = x[at + g]
-            for j in range(p + 1, f):
-                u = factor[row + j]
-                for g in range(GROUP):
-                    y[U(g)] -= u * local[U(j * GROUP + g)]
-            scale = 1.0 / factor[row + p]
-            for g in range(GROUP):
-                x[at + g] = local[p * GROUP + g] = y[g] * scale
+            u, at, to = start[s] + p * f + p, first + p, p
+            scale = 1.0 / factor[u]
+            y0, y1, y2, y3 = x[at], x[at + n], x[at + 2 * n], x[at + 3 * n]
+            for j in range(1, f - p):
+                y0 -= factor[U(u + j)] * local[U(to + j)]
+                y1 -= factor[U(u + j)] * local[U(to + f + j)]
+                y2 -= factor[U(u + j)] * local[U(to + 2 * f + j)]
+                y3 -= factor[U(u + j)] * local[U(to + 3 * f + j)]
+            y0, y1, y2, y3 = y0 * scale, y1 * scale, y2 * scale, y3 * scale
+            x[at], x[at + n], x[at + 2 * n], x[at + 3 * n] = y0, y1, y2, y3
+            local[to], local[to + f], local[to + 2 * f], local[to + 3 * f] = y0, y1, y2, y3
 
 
 def warm_up() -> None:

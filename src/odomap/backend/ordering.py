@@ -138,7 +138,7 @@ def _order(first: Index, second: Index, weight: Index, absorbed: Index, rank: In
             if after[i] >= 0:
                 before[after[i]] = i
             head[degree[i]] = i
-    stamp, least, left, step = np.int64(1), 0, total, 0
+    stamp, least, left, step = total + 1, 0, total, 0
     while left > 0:
         while head[least] < 0:
             least += 1
