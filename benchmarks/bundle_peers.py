@@ -105,9 +105,10 @@ class Ceres:
         options.callbacks = [note]
         summary = pyceres.SolverSummary()
         pyceres.solve(options, self.problem, summary)
-        self.preprocessor_s = min(self.preprocessor_s, summary.preprocessor_time_in_seconds)
+        before = summary.preprocessor_time_in_seconds
+        self.preprocessor_s = min(self.preprocessor_s, before)
         best = np.minimum.accumulate(costs).tolist()  # a refused step leaves the cost where it was
-        return Run(seconds, best, self.result())
+        return Run([s - before for s in seconds], best, self.result())
 
     def result(self) -> Array:
         """Return all that was found in one row: poses (K, 4, 4), points (M, 3), lenses (K, 3)."""
