@@ -6,8 +6,8 @@ part of Z that belongs to the front's border,
 
     W = U11⁻¹ U12,    Z12 = −W Z22,    Z11 = (U11ᵀ U11)⁻¹ − W Z12ᵀ.
 
-The border lies within the parent's front, so going from the roots down, Z22 is always at hand; it is
-copied along the runs by which the child's update went up. A wide front is taken in panels of 32
+The border lies within the parent's front, so going from the roots down, Z22 is always at hand; it
+is copied along the runs by which the child's update went up. A wide front is taken in panels of 32
 pivots, of which each has those behind it for its border: nearly all of the work is then W Z22, and
 runs through the same tile as the factorisation (see `fronts`). Waiting fronts lie one behind the
 other, from a root to where the walk is.
