@@ -34,16 +34,26 @@ from odomap.geometry.lie import (
     se2_adjoint,
     se2_inverse,
     se2_log,
+    se2_right_jacobian_inverse,
     se3_adjoint,
     se3_inverse,
     se3_log,
+    se3_right_jacobian_inverse,
     sim3_adjoint,
     sim3_inverse,
     sim3_log,
+    sim3_right_jacobian_inverse,
 )
 from odomap.kernels import kernel
 
-__all__ = ["LIE", "Consensus", "chi2_quantile", "covariance_of", "find_consensus", "warm_up"]
+__all__ = [
+    "LIE",
+    "Consensus",
+    "chi2_quantile",
+    "covariance_of",
+    "find_consensus",
+    "warm_up",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -54,6 +64,9 @@ _PARTNERS = 8
 
 _CHANCE = 1e-3
 """A test that an error drawn at random would pass more often than this confirms nothing."""
+
+_ACCIDENTS = 0.1
+"""How many tests of a graph of random edges may pass by accident and count as sure."""
 
 _FEWEST = 10
 """Tests that a variance factor is estimated from, at least."""
@@ -81,13 +94,14 @@ class LieFunctions(NamedTuple):
     inverse: Callable[[Array], Array]
     log: Callable[[Array], Array]
     adjoint: Callable[[Array], Array]
+    right_jacobian_inverse: Callable[[Array], Array]
 
 
 LIE = MappingProxyType(
     {
-        "SE2": LieFunctions(se2_inverse, se2_log, se2_adjoint),
-        "SE3": LieFunctions(se3_inverse, se3_log, se3_adjoint),
-        "Sim3": LieFunctions(sim3_inverse, sim3_log, sim3_adjoint),
+        "SE2": LieFunctions(se2_inverse, se2_log, se2_adjoint, se2_right_jacobian_inverse),
+        "SE3": LieFunctions(se3_inverse, se3_log, se3_adjoint, se3_right_jacobian_inverse),
+        "Sim3": LieFunctions(sim3_inverse, sim3_log, sim3_adjoint, sim3_right_jacobian_inverse),
     }
 )
 """Functions of each group of poses."""
@@ -138,14 +152,20 @@ def find_consensus(
     loop = _corrections(graph, chain, loops)
     with_others = _pairs(graph, chain, loop)
     with_odometry = _against_odometry(graph, chain, loop)
-    sure = with_others.spread <= np.median(with_others.spread)
-    variance = _variance_factor(with_others.chi2[sure], dim, quantile)
+    near = with_others.spread <= np.median(with_others.spread)
+    variance = _variance_factor(with_others.chi2[near], dim, quantile)
     gate = variance * chi2_quantile(dim, quantile)
-    for test in (with_others, with_odometry):
-        accepted = _ball(dim) * gate ** (0.5 * dim) * test.spread
-        agree = (test.chi2 < gate) & (accepted < _CHANCE * test.possible)
-        confirmed[loops[test.one[agree]]] = True
-        confirmed[loops[test.other[agree]]] = True
+    tests = with_others, with_odometry
+    sure = min(_CHANCE, _ACCIDENTS / max(sum(len(test.chi2) for test in tests), 1))
+    votes = np.zeros(len(loops))
+    for test in tests:
+        chance = _chance_of_agreement(graph, gate, test.spread, test.length)
+        agree = (test.chi2 < gate) & (chance < _CHANCE)
+        # Two votes of any kind are needed, and one that is hardly an accident counts as two.
+        vote = np.where(agree, np.where(chance < sure, 2.0, 1.0), 0.0)
+        votes += np.bincount(test.one, vote, len(loops))
+        votes += np.bincount(test.other, np.where(test.one != test.other, vote, 0.0), len(loops))
+    confirmed[loops[votes >= 2.0]] = True
     return Consensus(confirmed, variance)
 
 
@@ -203,13 +223,13 @@ class _Corrections(NamedTuple):
 
 
 class _Tests(NamedTuple):
-    """Loop edges compared: which (P,), χ² = eᵀ S⁻¹ e, √det S, and the volume of possible errors."""
+    """Loop edges compared: which (P,), χ² = eᵀ S⁻¹ e, √det S, and how long the cycle is."""
 
     one: Index
     other: Index
     chi2: Array
     spread: Array
-    possible: Array
+    length: Array
 
 
 def _in_world(graph: PoseGraph, Ts: Array, covariance: Array) -> Array:
@@ -250,7 +270,7 @@ def _pairs(graph: PoseGraph, chain: _Chain, loop: _Corrections) -> _Tests:
     lie = LIE[graph.group]
     e = lie.log(loop.G[one] @ lie.inverse(loop.G[other]))
     length = way + way_back + loop.length[one] + loop.length[other]
-    return _Tests(one, other, *_weigh(graph, e, S, length))
+    return _Tests(one, other, *_chi2_and_spread(e, S), length)
 
 
 def _against_odometry(graph: PoseGraph, chain: _Chain, loop: _Corrections) -> _Tests:
@@ -260,25 +280,32 @@ def _against_odometry(graph: PoseGraph, chain: _Chain, loop: _Corrections) -> _T
     way, length = chain.between(loop.begin[one], loop.end[one])
     e = LIE[graph.group].log(loop.G[one])
     length = length + loop.length[one]
-    return _Tests(one, one, *_weigh(graph, e, loop.covariance[one] + way, length))
+    return _Tests(one, one, *_chi2_and_spread(e, loop.covariance[one] + way), length)
 
 
-def _weigh(graph: PoseGraph, e: Array, S: Array, length: Array) -> tuple[Array, Array, Array]:
-    """Return eᵀ S⁻¹ e, √det S, and the volume of all errors e that were possible.
+def _chi2_and_spread(e: Array, S: Array) -> tuple[Array, Array]:
+    """Return eᵀ S⁻¹ e and √det S."""
+    chi2 = np.einsum("pa,pa->p", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
+    return np.maximum(chi2, 0.0), np.sqrt(np.maximum(np.linalg.det(S), 0.0))
+
+
+def _chance_of_agreement(graph: PoseGraph, gate: float, spread: Array, length: Array) -> Array:
+    """Return how often an error drawn at random would have eᵀ S⁻¹ e below a gate.
 
     A cycle of straight sides that measure `length` together may miss by that length, any turn, and
     any scale between 1/e and e.
+
+    Args:
+        graph: of poses.
+        gate: of the test.
+        spread: (n,) √det S.
+        length: (n,) of the cycle, metres.
     """
-    chi2 = np.einsum("pa,pa->p", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
-    spread = np.sqrt(np.maximum(np.linalg.det(S), 0.0))
-    turns_and_scales = {3: 2.0 * pi, 6: 8.0 * pi**2, 7: 16.0 * pi**2}[graph.dim]
-    possible = _ball(graph.space) * length**graph.space * turns_and_scales
-    return np.maximum(chi2, 0.0), spread, possible
-
-
-def _ball(dim: int) -> float:
-    """Return the volume of the unit ball."""
-    return float(pi ** (0.5 * dim) / gamma(0.5 * dim + 1.0))
+    k, d = graph.dim, graph.space
+    ball = {n: pi ** (0.5 * n) / gamma(0.5 * n + 1.0) for n in (k, d)}
+    turns_and_scales = {3: 2.0 * pi, 6: 8.0 * pi**2, 7: 16.0 * pi**2}[k]
+    possible = np.maximum(ball[d] * length**d * turns_and_scales, 1e-300)
+    return np.asarray(ball[k] * gate ** (0.5 * k) * spread / possible)
 
 
 def _variance_factor(chi2: Array, dim: int, quantile: float) -> float:

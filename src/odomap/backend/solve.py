@@ -24,7 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from odomap.backend.blocks import BlockPattern
 from odomap.backend.components import Components, find_components
+from odomap.backend.consensus import find_consensus
 from odomap.backend.descent import Descent, IterationRecord, SolverConfig, descend
+from odomap.backend.gnc import GncConfig, find_inliers
 from odomap.backend.graphproblem import GraphProblem, GraphState
 from odomap.backend.initialization import chordal, place_landmarks, spanning_tree
 from odomap.backend.ordering import approximate_minimum_degree
@@ -95,6 +97,7 @@ def solve(
     cost: Cost = "geodesic",
     initial: Initial = "auto",
     loss: Loss | None = None,
+    robust: Literal["gnc"] | GncConfig | None = None,
     weights: ArrayLike | None = None,
     config: SolverConfig | None = None,
     stop: Stop | None = None,
@@ -105,8 +108,10 @@ def solve(
     Args:
         graph: the problem; poses may be unknown (NaN).
         cost: "geodesic", of distances along the group, or "chordal", of SE-Sync, isotropic.
-        initial: where to begin; "auto" takes the better of what is given and chordal.
+        initial: where to begin; "auto" takes the better of what is given and chordal, with a
+            loss chordal without the loops that no other confirms. "gnc" has a start of its own.
         loss: robust loss of loop edges (`PoseGraph.is_loop`) and sights; default none.
+        robust: "gnc" finds false loop edges and leaves them out (`Solution.is_rejected`).
         weights: (E,) by which edges count; 0 leaves one out. Default 1.
         config: method and limits.
         stop: ends early, with what there is.
@@ -129,16 +134,41 @@ def solve(
     config = SolverConfig() if config is None else config
     loss = Loss() if loss is None else loss
     w = _checked_weights(graph, weights, cost)
-    components = find_components(graph, w, through_landmarks=True)
+    stopped = None if stop is None else stop.is_set
+    whole = graph
+    if robust is not None:
+        whole, w = _without_false_loops(graph, w, loss, robust, stopped)
+        initial = "given"
+    graph = whole.without(w == 0.0)  # what does not count is not to cost anything either
+    components = find_components(graph, through_landmarks=True)
     held = _held(graph, components)
     is_robust = graph.is_loop if loss.name != "quadratic" else np.zeros(graph.num_edges, bool)
-    problem = GraphProblem(graph, held, cost == "chordal", loss, is_robust, w)
+    problem = GraphProblem(graph, held, cost == "chordal", loss, is_robust, w[w > 0.0])
     order = _order(graph)
     problem.analyse(order)
     start, chosen = _start(graph, problem, initial, order)
-    stopped = None if stop is None else stop.is_set
+    chosen = chosen if robust is None else "gnc"
     descent = descend(problem, start, config, stopped, progress)
-    return _solution(graph, problem, descent, components.count, chosen)
+    if (w == 0.0).any():
+        is_robust = whole.is_loop & (loss.name != "quadratic")
+        problem = GraphProblem(whole, held, cost == "chordal", loss, is_robust, w)
+    return _solution(problem, loss, descent, components.count, chosen)
+
+
+def _without_false_loops(
+    graph: PoseGraph,
+    weights: Array,
+    loss: Loss,
+    robust: Literal["gnc"] | GncConfig,
+    stop: Callable[[], bool] | None,
+) -> tuple[PoseGraph, Array]:
+    """Return the graph near its solution without false loops, and weights without them."""
+    if not (robust == "gnc" or isinstance(robust, GncConfig)):
+        raise InputError(f"solve: robust '{robust}' is unknown, give gnc")
+    if loss.name != "quadratic":
+        raise InputError(f"solve: give robust or the loss {loss.name}, not both")
+    inliers = find_inliers(graph, weights, None if robust == "gnc" else robust, stop)
+    return graph.placed(inliers.Ts_world_node), np.where(inliers.is_inlier, weights, 0.0)
 
 
 def _checked_weights(graph: PoseGraph, weights: ArrayLike | None, cost: Cost) -> Array:
@@ -179,7 +209,10 @@ def _start(
         return _placed(graph, problem, spanning_tree(graph, weights)), initial
     if initial == "given":
         return _placed(graph, problem, graph.Ts_world_node), initial
-    ours = _placed(graph, problem, chordal(graph, order, weights))
+    used = weights
+    if problem.edges.is_robust.any() and initial == "auto":
+        used = weights * (~graph.is_loop | find_consensus(graph, weights).is_confirmed)
+    ours = _placed(graph, problem, chordal(graph, order, used))
     if initial == "chordal" or not is_known:
         return ours, "chordal"
     given = _placed(graph, problem, graph.Ts_world_node)
@@ -193,23 +226,27 @@ def _placed(graph: PoseGraph, problem: GraphProblem, Ts: Array) -> GraphState:
 
 
 def _solution(
-    graph: PoseGraph,
     problem: GraphProblem,
+    loss: Loss,
     descent: Descent[GraphState],
     num_components: int,
     initial: str,
 ) -> Solution:
+    """Return what was found, with χ² and weight of all edges, of those left out, too."""
     problem.cost_of_edges(descent.x)
-    edges = slice(0, graph.num_edges)
+    edges = slice(0, problem.graph.num_edges)
+    chi2, weights = problem.chi2[edges].copy(), problem.edges.weight[edges].copy()
+    is_robust = problem.edges.is_robust[edges]
+    weights[is_robust] *= loss.weight(chi2[is_robust])
     return Solution(
-        graph.placed(descent.x.Ts[:-1], descent.x.points),
+        problem.graph.placed(descent.x.Ts[:-1], descent.x.points),
         descent.cost_before,
         descent.cost_after,
         descent.iterations,
         descent.converged,
         descent.reason,
-        problem.chi2[edges].copy(),
-        problem.edges.weight[edges].copy(),
+        chi2,
+        weights,
         num_components,
         initial,
         descent.history,
