@@ -58,7 +58,7 @@ class AdjustmentConfig:
     method: Method = "auto"
     """How views are solved for: auto, factored or iterative (conjugate gradients)."""
     gauge: Literal["free", "hold"] = "free"
-    """hold: the first view and the scale of parts that nothing holds come back to what they were."""
+    """hold: first view and scale of a part that nothing holds come back to what they were."""
     iterations: Annotated[int, Limits(least=0)] = 100
     """Most steps tried."""
     tolerance: NotNegative = 1e-6

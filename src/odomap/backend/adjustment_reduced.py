@@ -38,8 +38,10 @@ Index = NDArray[np.int64]
 Method = Literal["auto", "factored", "iterative"]
 METHODS = ("auto", "factored", "iterative")
 
-FLOPS_PER_PRODUCT = 60.0
+PRODUCTS = 60.0
 """Products S x that a step of conjugate gradients is expected to take."""
+SMALL = 1e8
+"""Flops of a factor that are never worth avoiding."""
 SLOWER = 4.0
 """By how much a flop of a product, fetched from memory, costs more than one of a factor."""
 MAX_NUMBERS = 2**28
@@ -177,7 +179,7 @@ def reduced_solver(layout: Layout, lens: Index, method: Method, steps: int, eta:
     if method == "iterative" or (method == "auto" and _num_values(layout, lens) > MAX_NUMBERS):
         return Iterative(layout, lens, steps, eta)
     factored = Factored(layout, lens)
-    is_quick = factored.factor.flops <= FLOPS_PER_PRODUCT * SLOWER * product
+    is_quick = factored.factor.flops <= max(PRODUCTS * SLOWER * product, SMALL)
     if method == "factored" or (is_quick and factored.factor.num_nonzeros <= MAX_NUMBERS):
         return factored
     return Iterative(layout, lens, steps, eta)
