@@ -94,9 +94,9 @@ def adjust_file(
         check_out(path, file)
     problem = replace(
         problem,
-        is_free_intrinsic=not fix_intrinsics,
-        is_fixed_view=fix_cameras,
-        is_fixed_point=fix_points,
+        is_free_intrinsic=np.full(problem.intrinsics.shape, not fix_intrinsics),
+        is_fixed_view=np.full(problem.num_views, fix_cameras),
+        is_fixed_point=np.full(problem.num_points, fix_points),
     )
     compile_imported(tell)
     tell(0, 0, f"{problem.num_views} views, {problem.num_points} points")

@@ -66,6 +66,7 @@ def optimize(
     method: Literal["gauss_newton", "levenberg_marquardt", "dogleg"] = "dogleg",
     initial: "Initial" = "auto",
     loss: "Loss | None" = None,
+    robust: Literal["gnc"] | None = None,
     certify: bool = False,
     max_iterations: int = 100,
     skip_unknown: bool = False,
@@ -81,6 +82,7 @@ def optimize(
         method: of the descent.
         initial: where to begin: auto, given, spanning_tree or chordal.
         loss: robust loss of loop edges.
+        robust: "gnc" finds false loop edges and leaves them out.
         certify: whether to prove that no poses are better, by the chordal cost.
         max_iterations: most steps.
         skip_unknown: whether lines of unknown tags are passed over.
@@ -123,6 +125,7 @@ def optimize(
                 cost=cost,
                 initial=initial,
                 loss=loss,
+                robust=robust,
                 config=config,
                 stop=interrupt,
                 progress=lambda record: tell(record.iteration, 0, _step(record)),

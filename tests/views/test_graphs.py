@@ -55,8 +55,8 @@ def test_what_is_drawn(space, height):
         np.testing.assert_allclose(drawn["rejected"][0], graph.positions[[3, 15], :2])
     assert [text.get_text() for text in after.get_legend().get_texts()] == [
         "loop",
-        "path",
         "rejected",
+        "path",
         "landmark",
     ]
     assert figure_png(figure) == figure_png(

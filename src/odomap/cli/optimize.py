@@ -42,6 +42,8 @@ class Optimize:
     """Let loop edges that fit badly count less."""
     width: Annotated[float | None, tyro.conf.arg(metavar="SIGMAS")] = None
     """Where the loss sets in, in standard deviations; default by the loss."""
+    robust: Literal["gnc"] | None = None
+    """Gnc finds false loop edges, names them and leaves them out."""
     certify: bool = False
     """Prove that there are no better poses, if so."""
     max_iterations: Annotated[int, tyro.conf.arg(metavar="N")] = 100
@@ -69,6 +71,7 @@ class Optimize:
                 method=self.method,
                 initial=self.initial,
                 loss=loss,
+                robust=self.robust,
                 certify=self.certify,
                 max_iterations=self.max_iterations,
                 skip_unknown=self.skip_unknown,
@@ -79,6 +82,8 @@ class Optimize:
             print(f"odomap: warning: {count} lines of {tag} passed over", file=sys.stderr)
         for name, value in rows(result):
             print(f"{name:<16} {value}")
+        if self.robust is not None:
+            print(f"{'rejected':<16} {_rejected(result)}")
         return _code(result)
 
 
@@ -136,6 +141,16 @@ def rows(result: "OptimizeResult") -> list[tuple[str, str]]:
             ("", f"cost {proof.cost:.8g}; no poses cost less than {proof.lower_bound:.8g}"),
         ]
     return lines + [("wrote", str(path)) for path in result.written]
+
+
+def _rejected(result: "OptimizeResult") -> str:
+    """Return how many edges were found to be false, and the first of them by their nodes."""
+    import numpy as np
+
+    graph, edges = result.solution.graph, np.flatnonzero(result.solution.is_rejected)
+    shown = [f"{graph.ids[graph.first[e]]}-{graph.ids[graph.second[e]]}" for e in edges]
+    listed = ", ".join(shown[:MOST_LISTED]) + (", …" if len(shown) > MOST_LISTED else "")
+    return f"{len(edges)} of {int(graph.is_loop.sum())} loops{': ' if shown else ''}{listed}"
 
 
 def _parts(sizes: tuple[int, ...]) -> str:

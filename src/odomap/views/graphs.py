@@ -1,9 +1,9 @@
 """Pictures of a pose graph: where its nodes are, what ties them, and which ties were let go.
 
 Nodes that follow each other are joined by the path; the other edges, which close loops, lie behind
-it, faint, since there are often more of them than of the path; rejected ones are drawn on top. What
-is flat is seen from above, and what is not (a sphere, a garage of several floors) obliquely, by
-a parallel projection, so that lengths can be compared along each direction.
+it, faint, since there are often more of them than of the path; rejected ones stand out. What is
+flat is seen from above, and what is not (a sphere, a garage of several floors) obliquely, by a
+parallel projection, so that lengths can be compared along each direction.
 """
 
 import numpy as np
@@ -76,8 +76,8 @@ def _draw(ax: Axes, graph: PoseGraph, positions: Array, oblique: bool, rejected:
     path, loops = ~graph.is_loop & ~rejected, graph.is_loop & ~rejected
     for chosen, label, colour, width, order in (
         (loops, "loop", PALETTE["band"], 0.7, 1),
-        (path, "path", PALETTE["estimate"], 1.0, 2),
-        (rejected, "rejected", PALETTE["lost"], 0.9, 3),
+        (rejected, "rejected", PALETTE["lost"], 0.6, 2),
+        (path, "path", PALETTE["estimate"], 1.1, 3),
     ):
         edges = ends[chosen]
         if len(edges):
