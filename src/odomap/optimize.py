@@ -99,7 +99,7 @@ def optimize(
         'globally optimal'
     """
     from odomap.backend.certificate import certify as prove
-    from odomap.backend.components import find_components
+    from odomap.backend.certificate import check_certifiable
     from odomap.backend.descent import SolverConfig
     from odomap.backend.solve import solve
     from odomap.system.worker import deferred_interrupt
@@ -112,13 +112,11 @@ def optimize(
         check_out(graph, target)
     if out is not None:
         check_graph_file(out, file.graph)
-    where = f"{graph}: " if isinstance(graph, str | Path) else ""
     compile_imported(tell)
-    tell(0, 0, f"{file.graph.num_nodes} poses, {file.graph.num_edges} edges")
     with deferred_interrupt() as interrupt:
         try:
             if certify:
-                _check_certifiable(file.graph)
+                check_certifiable(file.graph)
             start = time.perf_counter()
             solution = solve(
                 file.graph,
@@ -131,18 +129,15 @@ def optimize(
                 progress=lambda record: tell(record.iteration, 0, _step(record)),
             )
         except InputError as error:
+            where = f"{graph}: " if isinstance(graph, str | Path) else ""
             raise InputError(f"{where}{str(error).removeprefix('pose graph: ')}") from error
         seconds = time.perf_counter() - start
         written = _write(file.graph, solution, out, picture)
         is_interrupted = interrupt.is_set()
-    certificate = None
-    if certify and not is_interrupted:
-        tell(0, 0, "proof")
-        certificate = prove(solution.graph.without(solution.is_rejected))
-    labels = find_components(file.graph, through_landmarks=True).label
-    sizes = tuple(int(n) for n in sorted(np.bincount(labels), reverse=True))
+    kept = solution.graph.without(solution.is_rejected)
+    certificate = prove(kept) if certify and not is_interrupted else None
     return OptimizeResult(
-        solution, cost, certificate, sizes, file.skipped, seconds, is_interrupted, written
+        solution, cost, certificate, _sizes(kept), file.skipped, seconds, is_interrupted, written
     )
 
 
@@ -167,16 +162,18 @@ def _checked_cost(cost: "Cost | None", loss: "Loss | None", certify: bool) -> "C
     return "chordal"
 
 
-def _check_certifiable(graph: PoseGraph) -> None:
-    from odomap.backend.certificate import check_certifiable
-
-    check_certifiable(graph)
-
-
 def _opened(graph: str | Path | PoseGraph, skip_unknown: bool) -> GraphFile:
     if isinstance(graph, PoseGraph):
         return GraphFile(graph, "g2o", {})
     return read_graph_file(graph, skip_unknown)
+
+
+def _sizes(graph: PoseGraph) -> tuple[int, ...]:
+    """Return how many nodes each connected component has, the largest first."""
+    from odomap.backend.components import find_components
+
+    label = find_components(graph, through_landmarks=True).label
+    return tuple(sorted(np.bincount(label).tolist(), reverse=True))
 
 
 def _write(
