@@ -211,15 +211,12 @@ class PoseGraph:
         return other
 
     def without(self, edges: NDArray[np.bool_]) -> Self:
-        """Return the graph without the edges marked (E,)."""
-        keep = ~np.asarray(edges, bool)
-        return replace(
-            self,
-            first=self.first[keep],
-            second=self.second[keep],
-            Ts_first_second=self.Ts_first_second[keep],
-            information=self.information[keep],
-        )
+        """Return the graph without the edges marked (E,); what is left needs no second check."""
+        other, keep = copy.copy(self), ~np.asarray(edges, bool)
+        if not keep.all():
+            for name in ("first", "second", "Ts_first_second", "information"):
+                other._set(name, getattr(self, name)[keep])
+        return other
 
 
 def _reals(values: ArrayLike, tail: tuple[int, ...], name: str) -> Array:
