@@ -112,7 +112,19 @@ def test_help_answers_at_once_and_loads_nothing_heavy():
 
 
 @pytest.mark.parametrize(
-    "verb", ["run", "demo", "calibrate", "eval", "export", "info", "config", "doctor"]
+    "verb",
+    [
+        "run",
+        "demo",
+        "calibrate",
+        "eval",
+        "optimize",
+        "bundle",
+        "export",
+        "info",
+        "config",
+        "doctor",
+    ],
 )
 def test_every_verb_has_help(cli, verb):
     code, out, _ = cli(verb, "--help")
@@ -138,7 +150,7 @@ def test_no_words_prints_help_and_fails(cli):
         (["rnu", "x"], "unknown command 'rnu' (did you mean 'run'?)"),
         (
             ["frobnicate"],
-            "one of run, demo, calibrate, eval, export, info, config, doctor expected",
+            "one of run, demo, calibrate, eval, optimize, bundle, export, info, config, doctor expected",
         ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),

@@ -20,7 +20,9 @@ from typing import TYPE_CHECKING
 from odomap.version import __version__
 
 if TYPE_CHECKING:
-    from odomap.backend.certificate import certify
+    from odomap.backend.adjustment import Adjustment, adjust
+    from odomap.backend.certificate import Certificate, certify
+    from odomap.backend.chordal import chordal_cost
     from odomap.backend.descent import SolverConfig
     from odomap.backend.posegraph import PoseGraph, Priors, Sights
     from odomap.backend.solve import Solution, solve
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from odomap.files.calibrations import read_calibration
     from odomap.files.clouds import read_ply, write_ply
     from odomap.files.g2o import read_g2o, write_g2o
+    from odomap.files.graphs import read_graph, write_graph
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
     from odomap.geometry.camera import Camera
@@ -61,8 +64,10 @@ __all__ = [
     "SE2",
     "SE3",
     "SO3",
+    "Adjustment",
     "CalibrationError",
     "Camera",
+    "Certificate",
     "Config",
     "ConfigError",
     "Estimate",
@@ -90,15 +95,18 @@ __all__ = [
     "Trajectory",
     "World",
     "__version__",
+    "adjust",
     "ate",
     "calibrate",
     "certify",
+    "chordal_cost",
     "export",
     "open",
     "preset",
     "read_bal",
     "read_calibration",
     "read_g2o",
+    "read_graph",
     "read_ply",
     "read_rig",
     "read_tum",
@@ -107,14 +115,17 @@ __all__ = [
     "solve",
     "write_bal",
     "write_g2o",
+    "write_graph",
     "write_ply",
     "write_rig",
     "write_tum",
 ]
 
 _HOMES = {
+    "Adjustment": "backend.adjustment",
     "CalibrationError": "errors",
     "Camera": "geometry.camera",
+    "Certificate": "backend.certificate",
     "Config": "system.config",
     "ConfigError": "errors",
     "Estimate": "maps.estimate",
@@ -144,15 +155,18 @@ _HOMES = {
     "TrackingFailed": "errors",
     "Trajectory": "geometry.trajectory",
     "World": "simulation.world",
+    "adjust": "backend.adjustment",
     "ate": "evaluation.metrics",
     "calibrate": "calibrate",
     "certify": "backend.certificate",
+    "chordal_cost": "backend.chordal",
     "export": "export",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
     "read_calibration": "files.calibrations",
     "read_g2o": "files.g2o",
+    "read_graph": "files.graphs",
     "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
@@ -161,6 +175,7 @@ _HOMES = {
     "solve": "backend.solve",
     "write_bal": "files.bal",
     "write_g2o": "files.g2o",
+    "write_graph": "files.graphs",
     "write_ply": "files.clouds",
     "write_rig": "files.rig",
     "write_tum": "files.trajectories",

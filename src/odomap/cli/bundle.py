@@ -11,7 +11,7 @@ from odomap.cli.optimize import chosen_loss
 from odomap.cli.progress import Steps
 
 if TYPE_CHECKING:
-    from odomap.adjust import AdjustResult
+    from odomap.bundle import AdjustResult
 
 __all__ = ["Bundle"]
 
@@ -51,7 +51,7 @@ class Bundle:
 
     def execute(self) -> int:
         """Solve, write, and say what was found."""
-        from odomap.adjust import adjust_file
+        from odomap.bundle import adjust_file
 
         loss = chosen_loss(self.loss, self.width)
         with Steps("bundle", self.quiet) as steps:

@@ -1,6 +1,6 @@
 """One call from a bundle adjustment problem's file to its best views: file → solver → files.
 
-    result = odomap.adjust.adjust_file("problem-49-7776-pre.txt.gz", "best.txt", cloud="best.ply")
+    result = odomap.bundle.adjust_file("problem-49-7776-pre.txt.gz", "best.txt", cloud="best.ply")
     result.solution.cost_after, result.rms_px, result.written
 
 Written are the problem at its best views, points and lenses, as BAL text, and the points with the
