@@ -3,7 +3,7 @@
 Run it with `python examples/12_spread_the_drift.py`; chapter 5 of docs/lesson explains it.
 """
 
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -15,24 +15,25 @@ TURN = np.radians(np.repeat([0, 90, -3.6, 0, -3.6], [40, 1, 75, 41, 25]))
 TRUE = se2_exp(np.column_stack([0 * TURN + 0.5, 0 * TURN, TURN]))
 # Wheels are good at going straight ahead and bad at turning: a tenth of each turn is noise.
 SIGMA = np.column_stack([0 * TURN + 0.01, 0 * TURN + 0.005, 0.001 + 0.1 * abs(TURN)])
+SIGMA_LOOP = [0.02, 0.02, 0.005]
 
 
 def walk(seed: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the measured steps, and the path by truth, odometry, and each correction."""
-    steps = TRUE @ se2_exp(SIGMA * np.random.default_rng(seed).standard_normal(SIGMA.shape))
+    rng = np.random.default_rng(seed)
+    steps = TRUE @ se2_exp(rng.normal(0.0, SIGMA))
     truth, odometry = (np.array([*accumulate([np.eye(3), *s], np.matmul)]) for s in (TRUE, steps))
     paths = {"truth": truth, "odometry": odometry, "gap spread": odometry.copy()}
-    T_start_end, n = truth[-1], len(steps)  # at the end the start is recognised, and how it lies
-    share = np.linspace(0.0, 1.0, n + 1)[:, None]
+    T_start_end = truth[-1] @ se2_exp(rng.normal(0.0, SIGMA_LOOP))  # recognised at the end
+    share = np.linspace(0.0, 1.0, len(truth))[:, None]
     paths["gap spread"][:, :2, 2] += share * (T_start_end - odometry[-1])[:2, 2]
     correction = se2_log(T_start_end @ se2_inverse(odometry[-1]))
     paths["motion spread"] = se2_exp(share * correction) @ odometry
-    first, second = np.append(np.arange(n), 0), np.append(np.arange(1, n + 1), n)
+    ends = np.array([*pairwise(range(len(truth))), (0, len(truth) - 1)]).T
     alike = SIGMA * 0 + np.sqrt(np.mean(SIGMA**2, axis=0))
     for name, sigma in (("graph, all steps alike", alike), ("graph", SIGMA)):
-        information = np.eye(3) / np.vstack([sigma, [0.02, 0.02, 0.005]])[:, None] ** 2
-        measured = np.concatenate([steps, [T_start_end]])
-        graph = PoseGraph("SE2", odometry, first, second, measured, information)
+        information = np.eye(3) / np.vstack([sigma, SIGMA_LOOP])[:, None] ** 2
+        graph = PoseGraph("SE2", odometry, *ends, np.append(steps, [T_start_end], 0), information)
         paths[name] = solve(graph).Ts_world_node
     return steps, paths
 
@@ -40,8 +41,7 @@ def walk(seed: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def ate(path: np.ndarray, truth: np.ndarray) -> float:
     """Return the ATE in metres: a point of the plane is a complex number, a turn is a factor."""
     p, q = ((Ts - Ts.mean(axis=0))[:, :2, 2] @ [1.0, 1.0j] for Ts in (path, truth))
-    turn = np.vdot(p, q) / abs(np.vdot(p, q))
-    return float(np.sqrt(np.mean(abs(q - turn * p) ** 2)))
+    return float(np.sqrt(np.mean(abs(q - np.exp(1j * np.angle(np.vdot(p, q))) * p) ** 2)))
 
 
 def main() -> dict[str, list[float]]:

@@ -13,12 +13,12 @@ from odomap.geometry import lie
 
 def two_rounds(seed: int) -> PoseGraph:
     """Return a graph of two rounds on a circle, each place of the second known from the first."""
-    k, per = np.arange(80), 40
+    k, per = np.arange(60), 30
     first, second = np.append(k[:-1], k[:-per:5]), np.append(k[1:], k[per::5])
     true = lie.se2_exp((second - first)[:, None] * [np.pi / 4, 0.0, 2 * np.pi / per])
     sigma = np.where((second - first == 1)[:, None], [0.05, 0.05, 0.1], [0.1, 0.1, 0.5])
     steps = true @ lie.se2_exp(np.random.default_rng(seed).normal(0.0, sigma))
-    odometry = [*accumulate([np.eye(3), *steps[:79]], np.matmul)]
+    odometry = [*accumulate([np.eye(3), *steps[:59]], np.matmul)]
     return PoseGraph("SE2", odometry, first, second, steps, np.eye(3) / sigma[:, None] ** 2)
 
 

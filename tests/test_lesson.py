@@ -4,9 +4,14 @@ A block of Python after a sentence with a link to an example is a part of that e
 Every other block of Python runs; the blocks of a chapter share their names, from first to last.
 """
 
+import io
 import re
+import runpy
 import textwrap
+from contextlib import redirect_stdout
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,6 +19,7 @@ from printed import assert_same_output
 
 ROOT = Path(__file__).parent.parent
 LESSON = ROOT / "docs" / "lesson"
+BACK_END = LESSON / "05_loop_closure_and_optimisation.md"
 PAGES = sorted(LESSON.glob("*.md"))
 CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
 EXAMPLE = re.compile(r"\(\.\./\.\./(examples/\w+\.py)\)")
@@ -34,6 +40,13 @@ def python_blocks(page: Path) -> list[tuple[str | None, str, str | None]]:
     return found
 
 
+def shown_outputs(page: Path) -> dict[str, list[str]]:
+    """Return what a page prints under `$ python examples/NAME`, by name."""
+    blocks = [block.splitlines() for block in page.read_text().split("```")[1::2]]
+    consoles = [lines for lines in blocks if lines[0] == "console"]
+    return {lines[1].removeprefix("$ python examples/"): lines[2:] for lines in consoles}
+
+
 def lines_of(code: str) -> list[str]:
     return [line.rstrip() for line in textwrap.dedent(code).strip().splitlines()]
 
@@ -42,6 +55,7 @@ def test_there_are_chapters():
     assert [page.name for page in CHAPTERS] == [
         "01_what_is_slam.md",
         "02_visual_odometry.md",
+        "05_loop_closure_and_optimisation.md",
     ]
 
 
@@ -97,6 +111,58 @@ def test_blocks_are_found():
     blocks = [block for page in CHAPTERS for block in python_blocks(page)]
     assert sum(source is not None for source, _, _ in blocks) >= 8
     assert sum(output is not None for _, _, output in blocks) >= 7
+
+
+@cache
+def ran(name: str) -> tuple[Any, str]:
+    """Run an example once; return its results and what it printed."""
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        results = runpy.run_path(str(ROOT / "examples" / name))["main"]()
+    return results, printed.getvalue()
+
+
+@pytest.mark.parametrize("name", shown_outputs(BACK_END))
+def test_the_back_end_prints_what_is_shown(name):
+    assert_same_output(ran(name)[1], shown_outputs(BACK_END)[name])
+
+
+def test_all_examples_of_the_back_end_are_shown():
+    files = {path.name for path in (ROOT / "examples").glob("1[2-7]_*.py")}
+    assert files == set(shown_outputs(BACK_END))
+
+
+def test_only_the_graph_knows_where_the_drift_came_from():
+    results = ran("12_spread_the_drift.py")[0]
+    names = ("gap spread", "motion spread", "graph, all steps alike", "graph")
+    medians = [results[name][1] for name in names]
+    assert medians == sorted(medians, reverse=True)
+    assert [results[name][2] < 4.0 for name in names] == [False, False, True, True]
+
+
+def test_a_solver_with_a_line_missing_is_not_a_solver():
+    costs = ran("13_gauss_newton.py")[0]
+    assert costs["gauge"] == pytest.approx(costs[""], rel=1e-6)
+    assert 1.002 * costs[""] < costs["J_r"] < 1.02 * costs[""]
+    assert min(costs["wrap"], costs["adjoint"]) > 1e3 * costs[""]
+
+
+def test_minimum_degree_is_worth_its_name():
+    results = ran("14_sparsity.py")[0]
+    assert 20 * results["minimum degree"][1] < results["any"][1] < results["as they came"][1]
+
+
+def test_the_start_decides_and_the_proof_tells():
+    results = ran("15_start_and_proof.py")[0]
+    assert 2.0 * results["chordal"] < results["spanning_tree"]
+    assert (results["0.25"], results["0.3"]) == (True, False)
+
+
+def test_only_the_bundle_is_honest():
+    results = ran("17_where_edges_come_from.py")[0]
+    assert results["edges, next"] < 0.4
+    assert 0.8 < results["sightings"] < 1.2
+    assert results["edges, all"] > 3.0
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
