@@ -47,6 +47,7 @@ from odomap.geometry.lie import (
 from odomap.kernels import kernel
 
 __all__ = [
+    "LEAST_VARIANCE",
     "LIE",
     "Consensus",
     "chi2_quantile",
@@ -70,6 +71,9 @@ _ACCIDENTS = 0.1
 
 _FEWEST = 10
 """Tests that a variance factor is estimated from, at least."""
+
+LEAST_VARIANCE = 1e-6
+"""Least variance factor: residuals below a thousandth of what is stated are rounding."""
 
 _TRACE = 1e-6
 """Information where an edge measured nothing, relative to the largest of its diagonal."""
@@ -117,8 +121,9 @@ def chi2_quantile(dim: int, share: float) -> float:
 def covariance_of(information: Array) -> Array:
     """Return inverses of information matrices (E, k, k); what was not measured is very unsure."""
     k = information.shape[1]
-    largest = np.diagonal(information, axis1=1, axis2=2).max(axis=1, initial=1e-300)
-    return np.linalg.inv(information + (_TRACE * largest)[:, None, None] * np.eye(k))
+    largest = np.diagonal(information, axis1=1, axis2=2).max(axis=1, initial=0.0)
+    trace = _TRACE * np.where(largest > 0.0, largest, 1.0)
+    return np.asarray(np.linalg.inv(information + trace[:, None, None] * np.eye(k)))
 
 
 def find_consensus(
@@ -318,7 +323,7 @@ def _variance_factor(chi2: Array, dim: int, quantile: float) -> float:
         last, variance = variance, float(np.median(agreeing)) / middle
         if abs(variance - last) <= 0.01 * last:
             break
-    return variance if 2 * len(agreeing) > len(chi2) and variance > 0.0 else 1.0
+    return max(variance, LEAST_VARIANCE) if 2 * len(agreeing) > len(chi2) else 1.0
 
 
 @kernel

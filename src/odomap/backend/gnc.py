@@ -2,11 +2,10 @@
 
 The problem: minimise the truncated squares Σ min(r², c²) over loop edges, beside the full squares
 of odometry, priors and sights, which are trusted. The truncation says which edges to leave out, but
-has a minimum for every set of them. So it is grown from a convex cost: for the parameter μ → ∞ of
+has a minimum for every set of them. So it is grown from a convex cost (μ → 0): with
 
-    w = 1                    r² < c² μ / (μ + 1)
-    w = 0                    r² > c² (μ + 1) / μ
-    w = c √(μ (μ + 1)) / r - μ    between
+
+    w = 1 below c² μ / (μ + 1),  0 above c² (μ + 1) / μ,  c √(μ (μ + 1)) / r - μ between
 
 weighted least squares alternates with these weights while μ grows from c² / (2 r_max² - c²), where
 the worst edge still has a vote, until all weights are 0 or 1. Three stages of it:
@@ -29,7 +28,12 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.consensus import chi2_quantile, covariance_of, find_consensus
+from odomap.backend.consensus import (
+    LEAST_VARIANCE,
+    chi2_quantile,
+    covariance_of,
+    find_consensus,
+)
 from odomap.backend.descent import SolverConfig
 from odomap.backend.posegraph import PoseGraph
 from odomap.backend.subgraph import Subgraph, SubgraphSolution
@@ -133,7 +137,7 @@ class _Search:
     def __init__(
         self, graph: PoseGraph, config: GncConfig, stop: Callable[[], bool] | None
     ) -> None:
-        self.graph, self.config = graph, config
+        self.graph, self.config, self.stop = graph, config, stop
         self.subgraph = Subgraph(graph, stop)
         self.consensus = find_consensus(graph, None, config.quantile)
         self.variance, self.rounds = self.consensus.variance, 0
@@ -144,13 +148,18 @@ class _Search:
         """Return which edges (E,) are true."""
         chosen = self._graduate(self.consensus.is_confirmed)
         if self.now.redundancy >= _FEWEST and (chosen & self.graph.is_loop).any():
-            self.variance = self.now.variance
+            self.variance = max(self.now.variance, LEAST_VARIANCE)
+        if self._is_stopped():
+            return chosen
         admitted = self._admit(np.flatnonzero(~chosen))
         if len(admitted):
             allowed = chosen.copy()
             allowed[admitted] = True
             chosen = self._check(self._graduate(allowed))
         return chosen
+
+    def _is_stopped(self) -> bool:
+        return self.stop is not None and self.stop()
 
     def _solve(self, weights: Array, steps: int) -> None:
         before = self.now if self.rounds else None
@@ -171,7 +180,8 @@ class _Search:
             last = weights
             weights = np.where(allowed, graduated_weights(chi2, self.gate, convexity), 0.0)
             weights[~self.graph.is_loop] = 1.0
-            if np.array_equal(weights, last) and np.isin(weights, (0.0, 1.0)).all():
+            is_settled = np.array_equal(weights, last) and np.isin(weights, (0.0, 1.0)).all()
+            if is_settled or self._is_stopped():
                 break
             convexity *= self.config.growth
         return np.asarray(weights > 0.5)
@@ -194,7 +204,7 @@ class _Search:
         while True:
             self._solve(chosen.astype(np.float64), _FIRST_STEPS)
             doubtful = np.flatnonzero(chosen & self.graph.is_loop & ~self.consensus.is_confirmed)
-            if not len(doubtful):
+            if not len(doubtful) or self._is_stopped():
                 return chosen
             costs = self._costs(doubtful)
             order = np.argsort(-costs, kind="stable")

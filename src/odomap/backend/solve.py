@@ -139,7 +139,8 @@ def solve(
     if robust is not None:
         whole, w = _without_false_loops(graph, w, loss, robust, stopped)
         initial = "given"
-    graph = whole.without(w == 0.0)  # what does not count is not to cost anything either
+    is_out = w == 0.0  # what does not count is not to cost anything either
+    graph = whole.without(is_out) if is_out.any() else whole
     components = find_components(graph, through_landmarks=True)
     held = _held(graph, components)
     is_robust = graph.is_loop if loss.name != "quadratic" else np.zeros(graph.num_edges, bool)
@@ -149,7 +150,7 @@ def solve(
     start, chosen = _start(graph, problem, initial, order)
     chosen = chosen if robust is None else "gnc"
     descent = descend(problem, start, config, stopped, progress)
-    if (w == 0.0).any():
+    if is_out.any():
         is_robust = whole.is_loop & (loss.name != "quadratic")
         problem = GraphProblem(whole, held, cost == "chordal", loss, is_robust, w)
     return _solution(problem, loss, descent, components.count, chosen)

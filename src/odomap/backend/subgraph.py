@@ -147,7 +147,8 @@ class Subgraph:
         def block(a: Index, b: Index) -> Array:
             free = (a >= 0) & (b >= 0)
             found = np.zeros((len(a), k, k))
-            found[free] = marginals.pairs(a[free], b[free])
+            if free.any():
+                found[free] = marginals.pairs(a[free], b[free])
             return found
 
         M, J = self._derivatives(solution, edges)
