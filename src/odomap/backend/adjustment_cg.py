@@ -57,34 +57,32 @@ def _multiply(
     y: Array,
 ) -> None:
     """y = D x + (couplings) x - V (Vᵀ x)."""
-    for b in range(len(blocks.size)):
-        size, at, row = blocks.size[b], blocks.at[b], blocks.row[b]
+    pose, lens_block, _, sizes, rows, block_at, _ = blocks
+    start, touched, _, slab_at, _, _ = incidences
+    for b in range(len(sizes)):
+        size, at, row = sizes[b], block_at[b], rows[b]
         for i in range(size):
             total = 0.0
             for j in range(size):
                 total += D[at + i * size + j] * x[row + j]
             y[row + i] = total
     for i in range(len(coupling)):
-        b, e = blocks.pose[i], blocks.lens[lens[i]]
+        b, e = pose[i], lens_block[lens[i]]
         if b >= 0 and e >= 0:
-            top, low = blocks.row[b], blocks.row[e]
             for j in range(6):
-                for k in range(blocks.size[e]):
-                    y[top + j] += coupling[i, j, k] * x[low + k]
-                    y[low + k] += coupling[i, j, k] * x[top + j]
-    for m in range(len(incidences.start) - 1):
-        first, last = incidences.start[m], incidences.start[m + 1]
+                for k in range(sizes[e]):
+                    y[rows[b] + j] += coupling[i, j, k] * x[rows[e] + k]
+                    y[rows[e] + k] += coupling[i, j, k] * x[rows[b] + j]
+    for m in range(len(start) - 1):
         z0, z1, z2 = 0.0, 0.0, 0.0
-        for e in range(first, last):
-            b, at = incidences.block[e], incidences.at[e]
-            size, row = blocks.size[b], blocks.row[b]
+        for e in range(start[m], start[m + 1]):
+            at, size, row = slab_at[e], sizes[touched[e]], rows[touched[e]]
             for i in range(size):
                 z0 += V[at + i] * x[row + i]
                 z1 += V[at + size + i] * x[row + i]
                 z2 += V[at + 2 * size + i] * x[row + i]
-        for e in range(first, last):
-            b, at = incidences.block[e], incidences.at[e]
-            size, row = blocks.size[b], blocks.row[b]
+        for e in range(start[m], start[m + 1]):
+            at, size, row = slab_at[e], sizes[touched[e]], rows[touched[e]]
             for i in range(size):
                 y[row + i] -= V[at + i] * z0 + V[at + size + i] * z1 + V[at + 2 * size + i] * z2
 
@@ -97,15 +95,17 @@ def precondition(
 
     False if one is not positive definite.
     """
-    V = system.V
+    _, _, _, sizes, rows, block_at, _ = blocks
+    _, touched, point, slab_at, _, _ = incidences
+    _, _, _, a, V, _, y, _, _ = system
     for i in range(len(D)):
         M[i] = D[i]
     for i in range(len(s)):
-        s[i] = system.a[i]
-    for e in range(len(incidences.block)):
-        b, at, m = incidences.block[e], incidences.at[e], incidences.point[e]
-        size, row, to = blocks.size[b], blocks.row[b], blocks.at[b]
-        y0, y1, y2 = system.y[m, 0], system.y[m, 1], system.y[m, 2]
+        s[i] = a[i]
+    for e in range(len(touched)):
+        b, at, m = touched[e], slab_at[e], point[e]
+        size, row, to = sizes[b], rows[b], block_at[b]
+        y0, y1, y2 = y[m, 0], y[m, 1], y[m, 2]
         for i in range(size):
             v0, v1, v2 = V[at + i], V[at + size + i], V[at + 2 * size + i]
             s[row + i] -= v0 * y0 + v1 * y1 + v2 * y2
@@ -113,22 +113,28 @@ def precondition(
                 M[to + i * size + j] -= (
                     v0 * V[at + j] + v1 * V[at + size + j] + v2 * V[at + 2 * size + j]
                 )
-    for b in range(len(blocks.size)):
-        size, at = blocks.size[b], blocks.at[b]
-        for j in range(size):
-            pivot = M[at + j * size + j]
+    is_definite = True
+    for b in range(len(sizes)):
+        is_definite = is_definite and _factor_block(D, M, block_at[b], sizes[b])
+    return is_definite
+
+
+@kernel(reorder=True)
+def _factor_block(D: Array, M: Array, at: int, size: int) -> bool:
+    """M = L Lᵀ in place, the diagonal inverted, which is what solving needs; D holds what M was."""
+    for j in range(size):
+        pivot = M[at + j * size + j]
+        for k in range(j):
+            pivot -= M[at + j * size + k] * M[at + j * size + k]
+        if not pivot > 1e-14 * D[at + j * size + j]:
+            return False
+        inverse = 1.0 / np.sqrt(pivot)
+        M[at + j * size + j] = inverse
+        for i in range(j + 1, size):
+            total = M[at + i * size + j]
             for k in range(j):
-                pivot -= M[at + j * size + k] * M[at + j * size + k]
-            if not pivot > 1e-14 * D[at + j * size + j]:
-                return False
-            inverse = 1.0 / np.sqrt(pivot)
-            # The inverse of the diagonal is kept: it is what solving needs.
-            M[at + j * size + j] = inverse
-            for i in range(j + 1, size):
-                total = M[at + i * size + j]
-                for k in range(j):
-                    total -= M[at + i * size + k] * M[at + j * size + k]
-                M[at + i * size + j] = total * inverse
+                total -= M[at + i * size + k] * M[at + j * size + k]
+            M[at + i * size + j] = total * inverse
     return True
 
 
@@ -136,8 +142,9 @@ def precondition(
 def _apply_inverse(blocks: Blocks, M: Array, r: Array, z: Array) -> float:
     """z = M⁻¹ r, block by block; returns r·z."""
     product = 0.0
-    for b in range(len(blocks.size)):
-        size, at, row = blocks.size[b], blocks.at[b], blocks.row[b]
+    sizes, rows, block_at = blocks.size, blocks.row, blocks.at
+    for b in range(len(sizes)):
+        size, at, row = sizes[b], block_at[b], rows[b]
         for i in range(size):
             total = r[row + i]
             for j in range(i):
@@ -155,12 +162,13 @@ def _apply_inverse(blocks: Blocks, M: Array, r: Array, z: Array) -> float:
 @kernel
 def start_conjugate(blocks: Blocks, M: Array, s: Array, state: Conjugate) -> None:
     """x = 0 of S x = -s."""
+    x, r, p, z, _, scalars = state
     for i in range(len(s)):
-        state.x[i], state.r[i] = 0.0, -s[i]
-    state.scalars[0] = _apply_inverse(blocks, M, state.r, state.z)
-    state.scalars[1], state.scalars[2] = 0.0, 0.0
+        x[i], r[i] = 0.0, -s[i]
+    scalars[0] = _apply_inverse(blocks, M, r, z)
+    scalars[1], scalars[2] = 0.0, 0.0
     for i in range(len(s)):
-        state.p[i] = state.z[i]
+        p[i] = z[i]
 
 
 @kernel
@@ -178,31 +186,31 @@ def conjugate_steps(
     state: Conjugate,
 ) -> bool:
     """Take some steps; True when the solution is good enough, or no step makes it better."""
-    x, r, p = state.x, state.r, state.p
+    x, r, p, z, Sp, scalars = state
     for _ in range(steps):
-        rz = state.scalars[0]
+        rz = scalars[0]
         if not rz > 0.0:
             return True
-        _multiply(blocks, incidences, D, lens, coupling, V, p, state.Sp)
+        _multiply(blocks, incidences, D, lens, coupling, V, p, Sp)
         curvature = 0.0
         for i in range(len(p)):
-            curvature += p[i] * state.Sp[i]
+            curvature += p[i] * Sp[i]
         if not curvature > 0.0:
             return True
         alpha = rz / curvature
         Q = 0.0
         for i in range(len(p)):
             x[i] += alpha * p[i]
-            r[i] -= alpha * state.Sp[i]
+            r[i] -= alpha * Sp[i]
             # Q = ½ xᵀ S x + sᵀ x, where S x = -s - r.
             Q += 0.5 * x[i] * (s[i] - r[i])
-        state.scalars[2] += 1.0
-        gain = state.scalars[2] * (Q - state.scalars[1])
-        state.scalars[1] = Q
+        scalars[2] += 1.0
+        gain = scalars[2] * (Q - scalars[1])
+        scalars[1] = Q
         if gain >= eta * Q:
             return True
-        state.scalars[0] = _apply_inverse(blocks, M, r, state.z)
-        beta = state.scalars[0] / rz
+        scalars[0] = _apply_inverse(blocks, M, r, z)
+        beta = scalars[0] / rz
         for i in range(len(p)):
-            p[i] = state.z[i] + beta * p[i]
+            p[i] = z[i] + beta * p[i]
     return False
