@@ -27,10 +27,10 @@ def timed(bundle: Bundle) -> Run:
     costs: list[float] = []
 
     def note(record: IterationRecord) -> None:
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
         costs.append(record.cost)
 
-    begin = time.perf_counter()
+    begin = time.process_time()
     found = adjust(problem, progress=note).problem
     result = (found.Ts_camera_world, found.points_world, found.intrinsics)
     return Run(seconds, costs, np.concatenate([array.ravel() for array in result]))

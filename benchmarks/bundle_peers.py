@@ -5,13 +5,14 @@
 Ceres is reached through pyceres; the cost functions are C++ too, COLMAP's automatically
 differentiated ones (pycolmap): its RADIAL model with the principal point held at zero is that of
 BAL, once y and z point the other way. Each configuration is tried once and the fastest again.
-Clocks are Ceres' own and start after its preprocessor, whose seconds are noted beside; building the
-problem is not in them.
+Clocks count processor time and start after Ceres' preprocessor, whose seconds are noted beside;
+building the problem is not in them.
 Needs numpy, pyceres and pycolmap; odomap is not imported.
 """
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -97,15 +98,17 @@ class Ceres:
 
         class Note(pyceres.IterationCallback):  # type: ignore[misc]
             def __call__(self, summary):  # type: ignore[no-untyped-def]
-                seconds.append(summary.cumulative_time_in_seconds)
+                seconds.append(time.process_time() - begin)
                 costs.append(summary.cost)
                 return pyceres.CallbackReturnType.SOLVER_CONTINUE
 
         note = Note()
         options.callbacks = [note]
         summary = pyceres.SolverSummary()
+        wall, begin = time.perf_counter(), time.process_time()
         pyceres.solve(options, self.problem, summary)
-        before = summary.preprocessor_time_in_seconds
+        share = (time.process_time() - begin) / (time.perf_counter() - wall)
+        before = share * summary.preprocessor_time_in_seconds
         self.preprocessor_s = min(self.preprocessor_s, before)
         best = np.minimum.accumulate(costs).tolist()  # a refused step leaves the cost where it was
         return Run([s - before for s in seconds], best, self.result())
