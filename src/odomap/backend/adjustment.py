@@ -29,10 +29,10 @@ from odomap.backend.adjustment_descent import Criteria, Descent, chi2_of, state_
 from odomap.backend.adjustment_gauge import Gauge, bring_back, find_gauge
 from odomap.backend.adjustment_layout import Layout, lay_out
 from odomap.backend.adjustment_problem import Adjustment
-from odomap.backend.adjustment_reduced import Method, reduced_solver
+from odomap.backend.adjustment_reduced import METHODS, Method, reduced_solver
 from odomap.backend.descent import IterationRecord
 from odomap.backend.solve import Stop
-from odomap.errors import InputError
+from odomap.errors import ConfigError, InputError
 from odomap.geometry.robust import Loss
 from odomap.limits import Count, Limits, NotNegative, Positive, check_limits
 
@@ -76,8 +76,10 @@ class AdjustmentConfig:
 
     def __post_init__(self) -> None:
         check_limits(self)
-        if self.gauge not in ("free", "hold"):
-            raise InputError(f"adjust: gauge '{self.gauge}' is unknown, give free or hold")
+        for name, known in (("method", METHODS), ("gauge", ("free", "hold"))):
+            value = getattr(self, name)
+            if value not in known:
+                raise ConfigError(f"{name}: '{value}' is unknown; known are {', '.join(known)}")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ from odomap.backend.adjustment_schur import (
     reduced_matrix,
 )
 from odomap.backend.blockcholesky import BlockCholesky
-from odomap.errors import InputError
 
 __all__ = ["METHODS", "Factored", "Iterative", "Method", "Pointwise", "Reduced", "reduced_solver"]
 
@@ -171,8 +170,6 @@ def reduced_solver(layout: Layout, lens: Index, method: Method, steps: int, eta:
         steps: most conjugate gradient steps.
         eta: when these are good enough.
     """
-    if method not in METHODS:
-        raise InputError(f"adjust: method '{method}' is unknown, give {', '.join(METHODS)}")
     if len(layout.blocks.size) == 0:
         return Pointwise()
     product = 4.0 * float(layout.incidences.at[-1])
