@@ -28,7 +28,7 @@ def test_small_residuals_count_fully_and_large_ones_less(name):
     assert np.all(loss.cost(s) <= s + 1e-12)
 
 
-@pytest.mark.parametrize("name", ["huber", "cauchy", "geman_mcclure", "tukey"])
+@pytest.mark.parametrize("name", ["huber", "cauchy", "geman_mcclure", "tukey", "dcs"])
 def test_the_default_constant_loses_five_percent_on_gaussian_noise(name):
     x = np.linspace(-12.0, 12.0, 200001)
     p = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) * (x[1] - x[0])

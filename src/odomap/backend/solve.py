@@ -108,8 +108,8 @@ def solve(
     Args:
         graph: the problem; poses may be unknown (NaN).
         cost: "geodesic", of distances along the group, or "chordal", of SE-Sync, isotropic.
-        initial: where to begin; "auto" takes the better of what is given and chordal, with a
-            loss chordal without the loops that no other confirms. "gnc" has a start of its own.
+        initial: where to begin; "auto" takes the better of what is given and chordal; with a loss,
+            chordal without the loops that no other confirms. "gnc" has a start of its own.
         loss: robust loss of loop edges (`PoseGraph.is_loop`) and sights; default none.
         robust: "gnc" finds false loop edges and leaves them out (`Solution.is_rejected`).
         weights: (E,) by which edges count; 0 leaves one out. Default 1.
@@ -173,8 +173,9 @@ def _without_false_loops(
 
 
 def _checked_weights(graph: PoseGraph, weights: ArrayLike | None, cost: Cost) -> Array:
-    if graph.num_nodes == 0 or graph.num_edges + len(graph.priors.node) == 0:
-        raise InputError("pose graph: it has no edges, there is nothing to solve")
+    measured = graph.num_edges + len(graph.priors.node) + len(graph.points.node)
+    if graph.num_nodes == 0 or measured == 0:
+        raise InputError("pose graph: nothing was measured, there is nothing to solve")
     if cost not in ("geodesic", "chordal"):
         raise InputError(f"solve: cost '{cost}' is unknown, give geodesic or chordal")
     if cost == "chordal" and graph.group == "Sim3":
@@ -210,11 +211,12 @@ def _start(
         return _placed(graph, problem, spanning_tree(graph, weights)), initial
     if initial == "given":
         return _placed(graph, problem, graph.Ts_world_node), initial
-    used = weights
-    if problem.edges.is_robust.any() and initial == "auto":
-        used = weights * (~graph.is_loop | find_consensus(graph, weights).is_confirmed)
-    ours = _placed(graph, problem, chordal(graph, order, used))
-    if initial == "chordal" or not is_known:
+    is_doubted = problem.edges.is_robust.any() and initial == "auto"
+    if is_doubted:
+        weights = weights * (~graph.is_loop | find_consensus(graph, weights).is_confirmed)
+    ours = _placed(graph, problem, chordal(graph, order, weights))
+    # A loss that lets go makes the poses of odometry look cheap: all loops are off, none counts.
+    if initial == "chordal" or is_doubted or not is_known:
         return ours, "chordal"
     given = _placed(graph, problem, graph.Ts_world_node)
     is_better = problem.cost_of_edges(given) <= problem.cost_of_edges(ours)

@@ -113,13 +113,13 @@ def tukey_weight(r2: ArrayLike, c: float = 4.685) -> Array:
     return np.asarray(rest * rest)
 
 
-def dcs_cost(r2: ArrayLike, c: float = 1.0) -> Array:
+def dcs_cost(r2: ArrayLike, c: float = 1.898) -> Array:
     """Return s up to c², then c² (3s - c²) / (s + c²), below 3c²; arguments as `huber_cost`."""
     s = np.asarray(r2, dtype=np.float64)
     return np.where(s <= c * c, s, c * c * (3.0 * s - c * c) / (s + c * c))
 
 
-def dcs_weight(r2: ArrayLike, c: float = 1.0) -> Array:
+def dcs_weight(r2: ArrayLike, c: float = 1.898) -> Array:
     """Return 1 up to c², then (2c² / (c² + s))²; arguments as `huber_cost`."""
     s = np.asarray(r2, dtype=np.float64)
     return np.asarray(np.minimum(1.0, 2.0 * c * c / (c * c + s)) ** 2)
@@ -145,7 +145,7 @@ LOSSES: Mapping[str, tuple[_Rule, _Rule, float]] = MappingProxyType(
         "geman_mcclure": (geman_mcclure_cost, geman_mcclure_weight, 3.787),
         "tukey": (tukey_cost, tukey_weight, 4.685),
         "truncated": (truncated_cost, truncated_weight, 3.0),
-        "dcs": (dcs_cost, dcs_weight, 1.0),
+        "dcs": (dcs_cost, dcs_weight, 1.898),
     }
 )
 """Cost, weight and default constant of each loss by name."""
