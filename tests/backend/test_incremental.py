@@ -199,6 +199,18 @@ def test_fixed_nodes_stay():
     assert graph.cost == pytest.approx(solve(graph.graph(), initial="given").cost_after, rel=0.01)
 
 
+def test_measurements_between_fixed_nodes_cost_what_they_cost():
+    graph = IncrementalPoseGraph("SE2")
+    for i in range(2):
+        graph.add_node(se2_exp([2.0 * i, 0.0, 0.0]), is_fixed=True)
+    graph.add_edge(0, 1, np.eye(3), np.eye(3))
+    assert graph.update().converged
+    assert graph.cost == pytest.approx(2.0)
+    graph.add_prior(1, np.eye(3), np.eye(3))
+    assert graph.update().converged
+    assert graph.cost == pytest.approx(4.0)
+
+
 def test_a_stopped_update_goes_on_at_the_next():
     _, edges = walk("SE2", np.random.default_rng(6), 80)
     graph = IncrementalPoseGraph("SE2")

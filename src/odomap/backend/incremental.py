@@ -112,7 +112,7 @@ class IncrementalPoseGraph:
         np.float64(2.0)
         >>> step[0, 2] = 2.1
         >>> graph.add_edge(0, 2, step, np.eye(3))
-        >>> graph.update().scope, graph.cost.__round__(6)
+        >>> graph.update().scope, round(graph.cost, 6)
         ('whole', 0.001667)
     """
 
@@ -130,6 +130,7 @@ class IncrementalPoseGraph:
         self._moved: list[int] = []
         self._seeds: list[int] = []
         self._num_redundant = 0
+        self._is_between_held = False  # a measurement no window sees
         self._num_solved = 0, 0
 
     def add_node(
@@ -190,7 +191,7 @@ class IncrementalPoseGraph:
         self._settle()
         if not self._seeds:
             return self._record("placed" if self._moved else "none", 0, True, "nothing to solve")
-        if len(self._seeds) <= self.config.window:
+        if len(self._seeds) <= self.config.window and not self._is_between_held:
             self._solve_window()
             if self._cost <= self._limit:
                 return self._record("window", 0, True, "within the bound")
@@ -242,8 +243,8 @@ class IncrementalPoseGraph:
         for prior in self._new_priors:
             moved = graph.settle_prior(prior)
             self._moved += moved
-            self._seeds += [] if moved else [graph.node_of_prior(prior)]
-            self._num_redundant += not moved
+            if not moved:
+                self._note([graph.node_of_prior(prior)])
         self._new_priors.clear()
         while self._new_edges:
             waiting = [edge for edge in self._new_edges if not self._settle_edge(edge)]
@@ -263,9 +264,14 @@ class IncrementalPoseGraph:
             return False
         self._moved += moved
         if not moved:
-            self._seeds += self._graph.nodes_of_edge(edge)
-            self._num_redundant += 1
+            self._note(self._graph.nodes_of_edge(edge))
         return True
+
+    def _note(self, nodes: list[int]) -> None:
+        """Note the nodes of a measurement that may cost something."""
+        self._seeds += nodes
+        self._num_redundant += 1
+        self._is_between_held |= bool(self._graph.is_held[nodes].all())
 
     def _problem(self, graph: PoseGraph, is_held: Bool) -> GraphProblem:
         """Return the cost of a graph, analysed."""
@@ -338,6 +344,7 @@ class IncrementalPoseGraph:
 
     def _record(self, scope: Scope, iterations: int, converged: bool, reason: str) -> UpdateRecord:
         """Return what was done, and forget what was new."""
+        self._is_between_held = False
         self._num_solved = self.num_edges, self._graph.num_priors
         moved = np.unique(np.array(self._moved, np.int64))
         self._moved, self._seeds = [], self._seeds if not converged else []
