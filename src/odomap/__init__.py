@@ -20,10 +20,13 @@ from typing import TYPE_CHECKING
 from odomap.version import __version__
 
 if TYPE_CHECKING:
-    from odomap.backend.adjustment import Adjustment, adjust
+    from odomap.backend.adjustment import Adjustment, AdjustmentConfig, AdjustmentSolution, adjust
+    from odomap.backend.adjustment_covariance import view_covariance
     from odomap.backend.certificate import Certificate, certify
     from odomap.backend.chordal import chordal_cost
+    from odomap.backend.covariances import covariances, joint_covariance, relative_covariance
     from odomap.backend.descent import SolverConfig
+    from odomap.backend.incremental import IncrementalPoseGraph
     from odomap.backend.posegraph import PoseGraph, Priors, Sights
     from odomap.backend.solve import Solution, solve
     from odomap.calibrate import calibrate
@@ -65,6 +68,8 @@ __all__ = [
     "SE3",
     "SO3",
     "Adjustment",
+    "AdjustmentConfig",
+    "AdjustmentSolution",
     "CalibrationError",
     "Camera",
     "Certificate",
@@ -72,6 +77,7 @@ __all__ = [
     "ConfigError",
     "Estimate",
     "Frame",
+    "IncrementalPoseGraph",
     "InputError",
     "Loss",
     "Map",
@@ -100,7 +106,9 @@ __all__ = [
     "calibrate",
     "certify",
     "chordal_cost",
+    "covariances",
     "export",
+    "joint_covariance",
     "open",
     "preset",
     "read_bal",
@@ -110,9 +118,11 @@ __all__ = [
     "read_ply",
     "read_rig",
     "read_tum",
+    "relative_covariance",
     "rpe",
     "run",
     "solve",
+    "view_covariance",
     "write_bal",
     "write_g2o",
     "write_graph",
@@ -123,6 +133,8 @@ __all__ = [
 
 _HOMES = {
     "Adjustment": "backend.adjustment",
+    "AdjustmentConfig": "backend.adjustment",
+    "AdjustmentSolution": "backend.adjustment",
     "CalibrationError": "errors",
     "Camera": "geometry.camera",
     "Certificate": "backend.certificate",
@@ -130,6 +142,7 @@ _HOMES = {
     "ConfigError": "errors",
     "Estimate": "maps.estimate",
     "Frame": "sensors.frame",
+    "IncrementalPoseGraph": "backend.incremental",
     "InputError": "errors",
     "Loss": "geometry.robust",
     "Map": "maps.map",
@@ -160,7 +173,9 @@ _HOMES = {
     "calibrate": "calibrate",
     "certify": "backend.certificate",
     "chordal_cost": "backend.chordal",
+    "covariances": "backend.covariances",
     "export": "export",
+    "joint_covariance": "backend.covariances",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
@@ -170,9 +185,11 @@ _HOMES = {
     "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
+    "relative_covariance": "backend.covariances",
     "rpe": "evaluation.metrics",
     "run": "run",
     "solve": "backend.solve",
+    "view_covariance": "backend.adjustment_covariance",
     "write_bal": "files.bal",
     "write_g2o": "files.g2o",
     "write_graph": "files.graphs",
