@@ -72,6 +72,9 @@ _ACCIDENTS = 0.1
 _FEWEST = 10
 """Tests that a variance factor is estimated from, at least."""
 
+_TOO_WIDE = 0.1
+"""A variance factor at which half of all errors drawn at random agree more often says nothing."""
+
 LEAST_VARIANCE = 1e-6
 """Least variance factor: residuals below a thousandth of what is stated are rounding."""
 
@@ -157,8 +160,7 @@ def find_consensus(
     loop = _corrections(graph, chain, loops)
     with_others = _pairs(graph, chain, loop)
     with_odometry = _against_odometry(graph, chain, loop)
-    near = with_others.spread <= np.median(with_others.spread)
-    variance = _variance_factor(with_others.chi2[near], dim, quantile)
+    variance = _variance_factor(graph, with_others, quantile)
     gate = variance * chi2_quantile(dim, quantile)
     tests = with_others, with_odometry
     sure = min(_CHANCE, _ACCIDENTS / max(sum(len(test.chi2) for test in tests), 1))
@@ -313,17 +315,27 @@ def _chance_of_agreement(graph: PoseGraph, gate: float, spread: Array, length: A
     return np.asarray(ball[k] * gate ** (0.5 * k) * spread / possible)
 
 
-def _variance_factor(chi2: Array, dim: int, quantile: float) -> float:
-    """Return v = median(χ² below the gate of v) / median of χ², 1 where most do not agree."""
+def _variance_factor(graph: PoseGraph, tests: _Tests, quantile: float) -> float:
+    """Return v = median(χ² below the gate of v) / median of χ², 1 where it cannot be told.
+
+    Only the surer half of the tests is asked. Most of these must agree, and not because the gate
+    of v has become so wide that any edges would.
+    """
+    order = np.argsort(tests.spread, kind="stable")[: (len(tests.one) + 1) // 2]
+    chi2, dim = tests.chi2[order], graph.dim
+    if len(chi2) < _FEWEST:
+        return 1.0
     middle, gate, variance = chi2_quantile(dim, 0.5), chi2_quantile(dim, quantile), 1.0
+    # From a factor at which at least a few agree.
+    variance = max(variance, float(np.partition(chi2, _FEWEST - 1)[_FEWEST - 1]) / gate)
     for _ in range(50):
-        agreeing = chi2[chi2 < variance * gate]
-        if len(agreeing) < _FEWEST:
-            return 1.0
-        last, variance = variance, float(np.median(agreeing)) / middle
+        agreeing = chi2[chi2 <= variance * gate]
+        last, variance = variance, max(float(np.median(agreeing)) / middle, LEAST_VARIANCE)
         if abs(variance - last) <= 0.01 * last:
             break
-    return max(variance, LEAST_VARIANCE) if 2 * len(agreeing) > len(chi2) else 1.0
+    chance = _chance_of_agreement(graph, variance * gate, tests.spread[order], tests.length[order])
+    is_told = 2 * len(agreeing) > len(chi2) and np.median(chance) < _TOO_WIDE
+    return variance if is_told else 1.0
 
 
 @kernel

@@ -4,7 +4,6 @@ The problem: minimise the truncated squares Σ min(r², c²) over loop edges, be
 of odometry, priors and sights, which are trusted. The truncation says which edges to leave out, but
 has a minimum for every set of them. So it is grown from a convex cost (μ → 0): with
 
-
     w = 1 below c² μ / (μ + 1),  0 above c² (μ + 1) / μ,  c √(μ (μ + 1)) / r - μ between
 
 weighted least squares alternates with these weights while μ grows from c² / (2 r_max² - c²), where
