@@ -5,8 +5,7 @@ Run it with `python examples/17_where_edges_come_from.py`; chapter 5 of docs/les
 
 import numpy as np
 
-from odomap import PoseGraph, Sights, solve
-from odomap import covariances
+from odomap import PoseGraph, Sights, covariances, solve
 from odomap.geometry.lie import se2_exp, se2_inverse, se2_log
 
 POSES, POINTS, SIGMA_M, RANGE_M = 12, 60, 0.05, 3.5
