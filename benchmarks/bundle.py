@@ -8,7 +8,8 @@ of the final one, building the problem excluded; the smallest over the repeats, 
 configuration (see `bundle_peers`). Ours begin with the arrays, before any analysis. Ceres' begin
 after its preprocessor: pyceres cannot be told an elimination order, and the search for one, which
 C++ callers are spared, can take as long as all else; it is printed below. Costs are
-½ Σ |residual|², by one function for both. Peak memory is of the whole process, Python's objects included.
+½ Σ |residual|², by one function for both. Peak memory is of the whole process, Python's objects
+included.
 
 The exit code is 1 where a bar is missed: Ladybug-49 at 13,344.4 within 1e-4 in at most Ceres' time;
 the ring within 1 % of Ceres' cost, in at most twice its time, under 4 GB.
