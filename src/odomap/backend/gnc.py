@@ -11,7 +11,7 @@ the worst edge still has a vote, until all weights are 0 or 1. Three stages of i
 
     confirmed   only the loops that others confirm (`consensus`); the rest has no say yet
     admitted    and those that this graph does not contradict: e'(Σ + J P J')⁻¹ e, P its covariance
-    checked     of these, out goes what costs more than c² by bending what little determines it
+    checked     out goes what costs much more than c² by bending what little determines it
 
 r² and c² are in the information as stated, unless it is too sure; predictions use the variance
 factor that the first stage leaves, Σ r² / (equations - unknowns). Cost: some ten factorisations.
@@ -44,8 +44,11 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_ADMIT = 9.0
-"""How much wider the gate of admission is than the final one: predictions far away are linear."""
+_WIDE = 9.0
+"""How much wider gates are where more is known, or less: three times as far.
+
+The gate of admission, since predictions far away are linear; and that of confirmed loops.
+"""
 
 _CHECK = 0.999
 """Share of true edges that pass the check: Baarda's, who takes nothing out on weak evidence."""
@@ -154,8 +157,8 @@ class _Search:
         if len(admitted):
             allowed = chosen.copy()
             allowed[admitted] = True
-            chosen = self._check(self._graduate(allowed))
-        return chosen
+            chosen = self._graduate(allowed)
+        return self._check(chosen)
 
     def _is_stopped(self) -> bool:
         return self.stop is not None and self.stop()
@@ -179,15 +182,18 @@ class _Search:
             last = weights
             weights = np.where(allowed, graduated_weights(chi2, self.gate, convexity), 0.0)
             weights[~self.graph.is_loop] = 1.0
-            is_settled = np.array_equal(weights, last) and np.isin(weights, (0.0, 1.0)).all()
-            if is_settled or self._is_stopped():
+            if np.array_equal(weights, last) and np.isin(weights, (0.0, 1.0)).all():
+                return np.asarray(weights == 1.0)
+            if self._is_stopped():
                 break
             convexity *= self.config.growth
-        return np.asarray(weights > 0.5)
+        chosen = np.asarray(weights > 0.5)
+        self._solve(chosen.astype(np.float64), _FIRST_STEPS)
+        return chosen
 
     def _admit(self, edges: Index) -> Index:
         """Return which edges (n,) the graph as it stands does not contradict."""
-        now, gate = self.now, _ADMIT * self.quantile * self.variance
+        now, gate = self.now, _WIDE * self.quantile * self.variance
         is_apart = self.subgraph.is_apart(now, edges)
         apart, tied = edges[is_apart], edges[~is_apart]
         # Bounds first: most false edges are too far off for any more to be asked.
@@ -198,20 +204,25 @@ class _Search:
         return np.sort(np.concatenate([apart, tied[near]]))
 
     def _check(self, chosen: Bool) -> Bool:
-        """Return the edges without those, confirmed by no other, that bend the graph too much."""
-        chosen, gate = chosen.copy(), chi2_quantile(self.graph.dim, _CHECK) * self.variance
+        """Return the edges without those loops that bend the graph too much.
+
+        What others confirm may be three times as far off.
+        """
+        dim, chosen = self.graph.dim, chosen.copy()
+        far = _WIDE * self.quantile, chi2_quantile(dim, _CHECK)
+        gates = self.variance * np.where(self.consensus.is_confirmed, *far)
         while True:
-            self._solve(chosen.astype(np.float64), _FIRST_STEPS)
-            doubtful = np.flatnonzero(chosen & self.graph.is_loop & ~self.consensus.is_confirmed)
-            if not len(doubtful) or self._is_stopped():
+            loops = np.flatnonzero(chosen & self.graph.is_loop)
+            if not len(loops) or self._is_stopped():
                 return chosen
-            costs = self._costs(doubtful)
-            order = np.argsort(-costs, kind="stable")
-            bad = order[costs[order] > gate]
+            excess = self._costs(loops) / gates[loops]
+            order = np.argsort(-excess, kind="stable")
+            bad = order[excess[order] > 1.0]
             if not len(bad):
                 return chosen
             # What is false makes others look false: the worse half goes, the rest is asked again.
-            chosen[doubtful[bad[: (len(bad) + 1) // 2]]] = False
+            chosen[loops[bad[: (len(bad) + 1) // 2]]] = False
+            self._solve(chosen.astype(np.float64), _FIRST_STEPS)
 
     def _costs(self, edges: Index) -> Array:
         """Return by how much Σ r² of the graph would fall without each edge.
