@@ -294,6 +294,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cap", type=float, default=20.0, help="seconds of one run")
     parser.add_argument("--core", type=int, default=-1, help="run on this one alone")
+    parser.add_argument("--only", default="", help="configurations whose names begin so")
     options = parser.parse_args()
     pin(options.core)
     with np.load(options.problem) as arrays:
@@ -302,7 +303,8 @@ def main() -> None:
         runners = PEERS[options.peer](problem, options.cap)
     except ImportError as error:
         sys.exit(f"{sys.executable} has no {options.peer}: {error}")
-    runs, failed = race(runners, options.repeats)
+    chosen = {name: run for name, run in runners.items() if name.startswith(options.only)}
+    runs, failed = race(chosen, options.repeats)
     write(Path(options.out), runs, failed)
 
 

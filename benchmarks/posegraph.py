@@ -134,6 +134,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cap", type=float, default=20.0, help="seconds of one run of a peer")
+    parser.add_argument("--only", default="", help="configurations of peers that begin so, as GN")
     parser.add_argument("--core", type=int, default=last_core(), help="which one; -1 for any")
     parser.add_argument("--verbose", action="store_true", help="print all configurations")
     parser.add_argument("--profile", action="store_true", help="where our time goes")
@@ -167,7 +168,8 @@ def compare(options: argparse.Namespace, problem: Problem, scratch: Path) -> Row
     runs = {"odomap": [outcome(ours, common, scratch)]}
     for name in options.peers:
         command = [options.peer_python, str(HERE / "graph_peers.py"), name, str(given)]
-        runs[name] = [outcome(command, [*common, "--cap", str(options.cap)], scratch)]
+        limits = ["--cap", str(options.cap), "--only", options.only]
+        runs[name] = [outcome(command, [*common, *limits], scratch)]
     runs["odomap"].append(outcome(ours, common, scratch))
     found = {name: best(problem, several) for name, several in runs.items()}
     mine = found.pop("odomap")
