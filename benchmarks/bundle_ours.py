@@ -16,7 +16,7 @@ import numpy as np
 from bundles import Bundle, load, ring
 from meter import peak_memory_mb
 
-from odomap.backend.adjustment import adjust
+from odomap.backend.adjustment.adjust import adjust
 from odomap.backend.descent import IterationRecord
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.adjustment_problem import BAL, Adjustment
+from odomap.backend.adjustment.problem import BAL, Adjustment
 from odomap.files.bal import read_bal
 from odomap.simulation.bundle import bundle_world
 

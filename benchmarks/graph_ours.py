@@ -16,9 +16,9 @@ from graph_peers import Run, pin, write  # isort: skip; first: sets the threads 
 
 from graphs import Problem, load
 
-from odomap.backend.certificate import certify
 from odomap.backend.descent import IterationRecord
-from odomap.backend.solve import solve
+from odomap.backend.graphs.certificate import certify
+from odomap.backend.graphs.solve import solve
 
 
 def timed(problem: Problem) -> Run:

@@ -11,9 +11,9 @@ from typing import Any
 
 from graphs import Problem
 
-import odomap.backend.solve as solving
-from odomap.backend.blockcholesky import BlockCholesky
-from odomap.backend.graphproblem import GraphProblem
+import odomap.backend.graphs.solve as solving
+from odomap.backend.graphs.graphproblem import GraphProblem
+from odomap.backend.sparse.blockcholesky import BlockCholesky
 
 PHASES: tuple[tuple[object, str, str], ...] = (
     (solving, "_order", "ordering"),

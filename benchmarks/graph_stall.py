@@ -13,7 +13,7 @@ from functools import partial
 
 from graphs import Problem
 
-from odomap.backend.solve import solve
+from odomap.backend.graphs.solve import solve
 
 LARGEST_STALL_S = 0.020
 

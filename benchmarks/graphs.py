@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.files.g2o import read_g2o
 from odomap.geometry.lie import se2_inverse, se2_log, se3_inverse, se3_log
 

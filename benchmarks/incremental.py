@@ -28,8 +28,8 @@ import numpy as np
 from graphs import Problem, read
 from meter import machine
 
-from odomap.backend.incremental import IncrementalPoseGraph
-from odomap.backend.solve import solve
+from odomap.backend.graphs.incremental import IncrementalPoseGraph
+from odomap.backend.graphs.solve import solve
 
 PEER = Path(__file__).parent / "incremental_peer.py"
 LARGEST_RATIO = 1.01

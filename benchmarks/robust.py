@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from odomap.backend.consensus import chi2_quantile, find_consensus
-from odomap.backend.posegraph import PoseGraph
-from odomap.backend.solve import solve
+from odomap.backend.graphs.consensus import chi2_quantile, find_consensus
+from odomap.backend.graphs.posegraph import PoseGraph
+from odomap.backend.graphs.solve import solve
 from odomap.files.g2o import read_g2o
 from odomap.geometry.align import umeyama
 from odomap.simulation.loops import with_false_loops

@@ -5,9 +5,9 @@ Run it with `python examples/14_sparsity.py`; chapter 5 of docs/lesson explains 
 
 import numpy as np
 
-from odomap.backend.blockcholesky import BlockCholesky
-from odomap.backend.blocks import BlockPattern
-from odomap.backend.ordering import approximate_minimum_degree
+from odomap.backend.sparse.blockcholesky import BlockCholesky
+from odomap.backend.sparse.blocks import BlockPattern
+from odomap.backend.sparse.ordering import approximate_minimum_degree
 
 
 def city(num_poses: int, seed: int = 0) -> BlockPattern:

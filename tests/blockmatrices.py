@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odomap.backend.blocks import BlockPattern
+from odomap.backend.sparse.blocks import BlockPattern
 
 
 def normal_equations(sizes, i, j, seed=0, prior=0.5):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odomap.backend.adjustment_problem import BAL, Adjustment
+from odomap.backend.adjustment.problem import BAL, Adjustment
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_exp, se3_inverse
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odomap.backend.posegraph import PoseGraph, Sights
+from odomap.backend.graphs.posegraph import PoseGraph, Sights
 from odomap.geometry import lie
 
 EXP = {"SE2": lie.se2_exp, "SE3": lie.se3_exp, "Sim3": lie.sim3_exp}

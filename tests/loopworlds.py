@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphworlds import DIM, EXP, INVERSE
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.geometry.lie import se2_exp, se3_exp, sim3_exp
 
 

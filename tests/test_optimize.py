@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.cli import main
 from odomap.cli.progress import Steps
 from odomap.errors import InputError

@@ -20,15 +20,20 @@ from typing import TYPE_CHECKING
 from odomap.version import __version__
 
 if TYPE_CHECKING:
-    from odomap.backend.adjustment import Adjustment, AdjustmentConfig, AdjustmentSolution, adjust
-    from odomap.backend.adjustment_covariance import view_covariance
-    from odomap.backend.certificate import Certificate, certify
-    from odomap.backend.chordal import chordal_cost
-    from odomap.backend.covariances import covariances, joint_covariance, relative_covariance
+    from odomap.backend.adjustment.adjust import (
+        Adjustment,
+        AdjustmentConfig,
+        AdjustmentSolution,
+        adjust,
+    )
+    from odomap.backend.adjustment.covariance import view_covariance
     from odomap.backend.descent import SolverConfig
-    from odomap.backend.incremental import IncrementalPoseGraph
-    from odomap.backend.posegraph import PoseGraph, Priors, Sights
-    from odomap.backend.solve import Solution, solve
+    from odomap.backend.graphs.certificate import Certificate, certify
+    from odomap.backend.graphs.chordal import chordal_cost
+    from odomap.backend.graphs.covariances import covariances, joint_covariance, relative_covariance
+    from odomap.backend.graphs.incremental import IncrementalPoseGraph
+    from odomap.backend.graphs.posegraph import PoseGraph, Priors, Sights
+    from odomap.backend.graphs.solve import Solution, solve
     from odomap.calibrate import calibrate
     from odomap.errors import (
         CalibrationError,
@@ -132,17 +137,17 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Adjustment": "backend.adjustment",
-    "AdjustmentConfig": "backend.adjustment",
-    "AdjustmentSolution": "backend.adjustment",
+    "Adjustment": "backend.adjustment.adjust",
+    "AdjustmentConfig": "backend.adjustment.adjust",
+    "AdjustmentSolution": "backend.adjustment.adjust",
     "CalibrationError": "errors",
     "Camera": "geometry.camera",
-    "Certificate": "backend.certificate",
+    "Certificate": "backend.graphs.certificate",
     "Config": "system.config",
     "ConfigError": "errors",
     "Estimate": "maps.estimate",
     "Frame": "sensors.frame",
-    "IncrementalPoseGraph": "backend.incremental",
+    "IncrementalPoseGraph": "backend.graphs.incremental",
     "InputError": "errors",
     "Loss": "geometry.robust",
     "Map": "maps.map",
@@ -150,17 +155,17 @@ _HOMES = {
     "MonocularVO": "system.odometry",
     "OdomapError": "errors",
     "OutputError": "errors",
-    "PoseGraph": "backend.posegraph",
-    "Priors": "backend.posegraph",
+    "PoseGraph": "backend.graphs.posegraph",
+    "Priors": "backend.graphs.posegraph",
     "Result": "system.odometry",
     "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
     "SE2": "geometry.pose",
     "SE3": "geometry.pose",
     "SO3": "geometry.pose",
-    "Sights": "backend.posegraph",
+    "Sights": "backend.graphs.posegraph",
     "Sim3": "geometry.pose",
-    "Solution": "backend.solve",
+    "Solution": "backend.graphs.solve",
     "SolverConfig": "backend.descent",
     "Source": "sources.source",
     "Status": "maps.estimate",
@@ -168,14 +173,14 @@ _HOMES = {
     "TrackingFailed": "errors",
     "Trajectory": "geometry.trajectory",
     "World": "simulation.world",
-    "adjust": "backend.adjustment",
+    "adjust": "backend.adjustment.adjust",
     "ate": "evaluation.metrics",
     "calibrate": "calibrate",
-    "certify": "backend.certificate",
-    "chordal_cost": "backend.chordal",
-    "covariances": "backend.covariances",
+    "certify": "backend.graphs.certificate",
+    "chordal_cost": "backend.graphs.chordal",
+    "covariances": "backend.graphs.covariances",
     "export": "export",
-    "joint_covariance": "backend.covariances",
+    "joint_covariance": "backend.graphs.covariances",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
@@ -185,11 +190,11 @@ _HOMES = {
     "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
-    "relative_covariance": "backend.covariances",
+    "relative_covariance": "backend.graphs.covariances",
     "rpe": "evaluation.metrics",
     "run": "run",
-    "solve": "backend.solve",
-    "view_covariance": "backend.adjustment_covariance",
+    "solve": "backend.graphs.solve",
+    "view_covariance": "backend.adjustment.covariance",
     "write_bal": "files.bal",
     "write_g2o": "files.g2o",
     "write_graph": "files.graphs",

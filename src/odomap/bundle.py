@@ -20,7 +20,7 @@ from odomap.files.bal import read_bal, write_bal
 from odomap.solving import Tell, check_out, compile_imported
 
 if TYPE_CHECKING:
-    from odomap.backend.adjustment import Adjustment, AdjustmentSolution
+    from odomap.backend.adjustment.adjust import Adjustment, AdjustmentSolution
     from odomap.backend.descent import IterationRecord
     from odomap.geometry.robust import Loss
 
@@ -84,7 +84,7 @@ def adjust_file(
         InputError: the file, or what is asked of it, cannot be.
         OutputError: the results cannot be written.
     """
-    from odomap.backend.adjustment import AdjustmentConfig, adjust
+    from odomap.backend.adjustment.adjust import AdjustmentConfig, adjust
     from odomap.system.worker import deferred_interrupt
 
     tell = progress or (lambda *_: None)

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.errors import InputError
 from odomap.files.atomic import write_bytes
 from odomap.files.graphs import GraphFile, check_graph_file, read_graph_file, write_graph
 from odomap.solving import Tell, check_out, compile_imported
 
 if TYPE_CHECKING:
-    from odomap.backend.certificate import Certificate
     from odomap.backend.descent import IterationRecord
-    from odomap.backend.solve import Cost, Initial, Solution
+    from odomap.backend.graphs.certificate import Certificate
+    from odomap.backend.graphs.solve import Cost, Initial, Solution
     from odomap.geometry.robust import Loss
 
 __all__ = ["OptimizeResult", "optimize", "picture_beside"]
@@ -98,10 +98,10 @@ def optimize(
         >>> result.certificate.reason  # doctest: +SKIP
         'globally optimal'
     """
-    from odomap.backend.certificate import certify as prove
-    from odomap.backend.certificate import check_certifiable
     from odomap.backend.descent import SolverConfig
-    from odomap.backend.solve import solve
+    from odomap.backend.graphs.certificate import certify as prove
+    from odomap.backend.graphs.certificate import check_certifiable
+    from odomap.backend.graphs.solve import solve
     from odomap.system.worker import deferred_interrupt
 
     tell = progress or (lambda *_: None)
@@ -170,7 +170,7 @@ def _opened(graph: str | Path | PoseGraph, skip_unknown: bool) -> GraphFile:
 
 def _sizes(graph: PoseGraph) -> tuple[int, ...]:
     """Return how many nodes each connected component has, the largest first."""
-    from odomap.backend.components import find_components
+    from odomap.backend.graphs.components import find_components
 
     label = find_components(graph, through_landmarks=True).label
     return tuple(sorted(np.bincount(label).tolist(), reverse=True))
@@ -196,8 +196,8 @@ def _write(
 
 def _start(graph: PoseGraph) -> tuple[str, NDArray[np.float64]]:
     """Return what to show as the start: the file's poses, or where dead reckoning leads."""
-    from odomap.backend.components import find_components
-    from odomap.backend.initialization import spanning_tree
+    from odomap.backend.graphs.components import find_components
+    from odomap.backend.graphs.initialization import spanning_tree
 
     if np.isfinite(graph.Ts_world_node).all():
         return "Before", graph.positions

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from odomap.backend.blockcholesky import BlockCholesky
-from odomap.backend.blocks import BlockPattern
 from odomap.backend.descent import SolverConfig, descend
+from odomap.backend.sparse.blockcholesky import BlockCholesky
+from odomap.backend.sparse.blocks import BlockPattern
 from odomap.errors import ConfigError
 
 METHODS = ("gauss_newton", "levenberg_marquardt", "dogleg")

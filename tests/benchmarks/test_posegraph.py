@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from odomap.backend.chordal import chordal_cost
-from odomap.backend.solve import solve
+from odomap.backend.graphs.chordal import chordal_cost
+from odomap.backend.graphs.solve import solve
 from odomap.files.g2o import read_g2o
 from odomap.geometry.lie import quaternion_from_rotation, se2_exp, se3_exp, so3_exp
 

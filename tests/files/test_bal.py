@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from odomap.backend.adjustment_problem import Adjustment
+from odomap.backend.adjustment.problem import Adjustment
 from odomap.errors import InputError
 from odomap.files.bal import read_bal, write_bal
 from odomap.geometry.lie import se3_exp, so3_exp

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from odomap.backend.posegraph import GROUPS, PoseGraph, Priors, Sights
+from odomap.backend.graphs.posegraph import GROUPS, PoseGraph, Priors, Sights
 from odomap.errors import InputError
 from odomap.files.g2o import read_g2o, write_g2o
 from odomap.files.graphposes import numbers_from_poses, poses_from_numbers

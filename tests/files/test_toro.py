@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.errors import InputError
 from odomap.files.g2o import read_g2o, write_g2o
 from odomap.files.graphposes import euler_from_rotation, rotation_from_euler

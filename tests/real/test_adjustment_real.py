@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odomap.backend.adjustment import AdjustmentConfig, adjust, view_covariance
+from odomap.backend.adjustment.adjust import AdjustmentConfig, adjust, view_covariance
 from odomap.files.bal import read_bal
 
 BEST = 13_344.4

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from odomap.backend.certificate import certify
-from odomap.backend.chordal import chordal_cost
 from odomap.backend.descent import SolverConfig
-from odomap.backend.initialization import chordal
-from odomap.backend.solve import solve
+from odomap.backend.graphs.certificate import certify
+from odomap.backend.graphs.chordal import chordal_cost
+from odomap.backend.graphs.initialization import chordal
+from odomap.backend.graphs.solve import solve
 from odomap.files.graphs import read_graph
 
 # Rosen et al., "SE-Sync", IJRR 2019, table 1; of small grids the full matrix' eigenvalues agree.

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from odomap.backend.incremental import IncrementalPoseGraph
-from odomap.backend.posegraph import PoseGraph
-from odomap.backend.solve import solve
+from odomap.backend.graphs.incremental import IncrementalPoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
+from odomap.backend.graphs.solve import solve
 from odomap.files.graphs import read_graph
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from odomap.backend.solve import solve
+from odomap.backend.graphs.solve import solve
 from odomap.files.g2o import read_g2o
 from odomap.geometry.align import umeyama
 from odomap.simulation.loops import with_false_loops

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 
-from odomap.backend.posegraph import PoseGraph, Sights
+from odomap.backend.graphs.posegraph import PoseGraph, Sights
 from odomap.geometry.lie import se2_exp, se3_exp
 from odomap.views.graphs import graph_figure
 from odomap.views.style import figure_png

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from odomap import Loss, PoseGraph, Trajectory, ate, solve
-from odomap.backend.blocks import BlockPattern
-from odomap.backend.initialization import spanning_tree
+from odomap.backend.graphs.initialization import spanning_tree
+from odomap.backend.sparse.blocks import BlockPattern
 from odomap.geometry.lie import se2_exp
 from odomap.views.style import PALETTE, dress, figure_png, new_figure
 

@@ -26,8 +26,8 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, Protocol, TypeV
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.blockcholesky import BlockCholesky
-from odomap.backend.blocks import BlockPattern
+from odomap.backend.sparse.blockcholesky import BlockCholesky
+from odomap.backend.sparse.blocks import BlockPattern
 from odomap.limits import Limits, NotNegative, Positive, check_limits
 
 __all__ = ["Descent", "IterationRecord", "Linear", "Method", "Problem", "SolverConfig", "descend"]

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.adjustment_problem import BAL, Adjustment
+from odomap.backend.adjustment.problem import BAL, Adjustment
 from odomap.errors import InputError
 from odomap.files.atomic import write_bytes
 from odomap.files.text import read_text

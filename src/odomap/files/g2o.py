@@ -24,7 +24,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from odomap.backend.posegraph import Group, PoseGraph
+from odomap.backend.graphs.posegraph import Group, PoseGraph
 from odomap.errors import InputError
 from odomap.files.atomic import write_bytes
 from odomap.files.graphlines import Layout, Lines, Rows, parse_lines

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from odomap.backend.posegraph import GROUPS, Group, PoseGraph, Priors, Sights
+from odomap.backend.graphs.posegraph import GROUPS, Group, PoseGraph, Priors, Sights
 from odomap.errors import InputError
 from odomap.files.graphlines import Array, Index, Rows
 from odomap.files.graphposes import (

@@ -18,7 +18,7 @@ vectors", Stanford University 2006.
 
 import numpy as np
 
-from odomap.backend.posegraph import Group
+from odomap.backend.graphs.posegraph import Group
 from odomap.files.graphlines import Array
 from odomap.geometry.lie import quaternion_from_rotation, rotation_from_quaternion, so2_exp, so2_log
 

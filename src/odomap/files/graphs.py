@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.files.g2o import G2O, parts_of_g2o, write_g2o
 from odomap.files.graphlines import parse_lines
 from odomap.files.text import read_text

@@ -19,7 +19,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.errors import InputError
 from odomap.files.g2o import G2O, ROLES, write_rows
 from odomap.files.graphlines import Array, Layout, Lines, Rows, parse_lines

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.adjustment_problem import BAL, Adjustment
+from odomap.backend.adjustment.problem import BAL, Adjustment
 from odomap.errors import InputError
 from odomap.geometry.lie import se3_exp, se3_inverse
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.errors import InputError
 from odomap.geometry.lie import (
     rotation_from_quaternion,

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from odomap.backend.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.views.scene import AXES, thin
 from odomap.views.style import PALETTE, dress, legend, new_figure
 

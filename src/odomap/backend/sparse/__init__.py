@@ -1,0 +1,1 @@
+"""Sparse symmetric systems of small blocks: order, analyse, factor, solve, invert in part."""
