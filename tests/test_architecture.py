@@ -18,7 +18,8 @@ BANNED = {"utils", "util", "common", "helpers", "helper", "base", "manager", "mi
 
 THREADS = {"threading", "queue", "multiprocessing", "_thread", "asyncio"}
 MAY_IMPORT_THREADS = {
-    "system/worker.py": "runs the stages",
+    "system/worker.py": "Ctrl-C as an event",
+    "system/background.py": "runs the stages beside the tracker",
     "maps/skeleton.py": "the lock of the map",
     "run.py": "Ctrl-C as an event",
 }

@@ -178,8 +178,8 @@ def test_config_changes_the_run(world, tmp_path):
 
 
 def test_refusals(world, tmp_path):
-    with pytest.raises(ConfigError, match="'live' is not in this version; use one of: inline"):
-        run(world, rhythm="live")
+    with pytest.raises(ConfigError, match="'locked' is unknown.*use one of: inline, lockstep"):
+        run(world, rhythm="locked")
     with pytest.raises(ConfigError, match="did you mean 'stereo'"):
         run(world, preset="streo")
     with pytest.raises(InputError, match="max_frames"):

@@ -135,7 +135,8 @@ def run(
     """
     from odomap.outputs import Outputs
     from odomap.sources.source import Source
-    from odomap.system.worker import check_rhythm, deferred_interrupt
+    from odomap.system.rhythms import check_rhythm
+    from odomap.system.worker import deferred_interrupt
 
     check_rhythm(rhythm)
     if max_frames is not None and max_frames < 1:

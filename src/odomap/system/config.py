@@ -20,6 +20,7 @@ from odomap.system.association import (
     FlowAssociation,
     TrackingConfig,
 )
+from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
 from odomap.system.mapping import WindowConfig
 from odomap.system.uncertainty import NoiseConfig
@@ -59,6 +60,8 @@ class Config:
     """When two views of one camera are enough to start."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     """How far what is measured may be off."""
+    threads: ThreadConfig = field(default_factory=ThreadConfig)
+    """When what is found beside the tracker reaches it."""
 
 
 def _mono() -> Config:

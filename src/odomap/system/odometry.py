@@ -32,10 +32,10 @@ from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.mapping import WindowMapper
 from odomap.system.ranging import DepthRanger, Ranger, StereoRanger
+from odomap.system.rhythms import make_worker
 from odomap.system.stages import Stages
 from odomap.system.starting import OneViewStart, Start, TwoViewsStart
 from odomap.system.tracking import Tracker
-from odomap.system.worker import make_worker
 from odomap.vision.rectifier import Rectifier
 
 __all__ = ["MonocularVO", "Odometry", "Result", "RgbdVO", "StereoVO", "make_odometry"]
@@ -94,7 +94,8 @@ class Odometry:
             config.noise,
             *depth,
         )
-        self.worker = make_worker(rhythm, Stages(self.map, self._tracker, mapper))
+        stages = Stages(self.map, self._tracker, mapper)
+        self.worker = make_worker(rhythm, stages, config.threads)
 
     def track(self, frame: Frame) -> Estimate:
         """Place one frame.
@@ -131,7 +132,7 @@ class StereoVO(Odometry):
     Args:
         rig: with two cameras.
         config: sections for all parts; default the preset "stereo".
-        rhythm: which thread runs what; see `worker`.
+        rhythm: which thread runs what; see `rhythms`.
 
     Raises:
         CalibrationError: if the rig has no plausible stereo pair.
@@ -154,7 +155,7 @@ class MonocularVO(Odometry):
     Args:
         camera: its lens; the first image of a frame is looked at.
         config: sections for all parts; default the preset "mono".
-        rhythm: which thread runs what; see `worker`.
+        rhythm: which thread runs what; see `rhythms`.
         T_body_camera: its mount on a rig, which a result tells; poses are the camera's anyway.
 
     Raises:
@@ -185,7 +186,7 @@ class RgbdVO(Odometry):
     Args:
         rig: with a camera and a depth image.
         config: sections for all parts; default the preset "rgbd".
-        rhythm: which thread runs what; see `worker`.
+        rhythm: which thread runs what; see `rhythms`.
 
     Raises:
         CalibrationError: if the rig has no depth image.
@@ -207,7 +208,7 @@ def make_odometry(rig: Rig, config: Config, rhythm: str = "inline") -> Odometry:
     Args:
         rig: what there is.
         config: `tracking.sensors` says which of it is used.
-        rhythm: which thread runs what; see `worker`.
+        rhythm: which thread runs what; see `rhythms`.
 
     Raises:
         CalibrationError: the rig does not carry that.

@@ -1,15 +1,17 @@
-"""Workers: who runs which stage when. The only place with threads, queues and events.
+"""Workers: who runs which stage when.
 
-A rhythm is a class here; stages, map and observers are the same in all of them.
+A rhythm is a class; stages, map and observers are the same in all of them (`rhythms` names them).
 
     inline    each stage in turn: frame, then mapping, then closing; the same bytes on every run
+    lockstep  mapping beside tracking, its result due a fixed number of frames later; the same bytes
+    live      mapping beside tracking, as fast as it goes; frames that come too fast are dropped
 
 Observers are lists on the worker: `on_estimate`, `on_keyframe`, `on_loop`, `on_map` hold callables,
 which are given frozen values. One that raises is detached, its error kept in `failures` and logged;
 the run goes on. A first Ctrl-C lets the frame at hand finish, so that nothing is left half written,
-and ends the run; a second one interrupts at once.
+and ends the run; a second one interrupts at once. No thread outlives `finish` or `close`.
 
-    worker = make_worker("inline", Stages(map, tracker))
+    worker = InlineWorker(Stages(map, tracker))
     worker.on_estimate.append(print)
     for frame, estimate in worker.run(source): ...
     worker.finish()
@@ -20,31 +22,25 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from types import FrameType, MappingProxyType
+from types import FrameType
 from typing import TypeVar
 
-from odomap.errors import ConfigError, nearest_name
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
 from odomap.system.stages import Loop, MapState, Stages
 
 __all__ = [
-    "RHYTHMS",
     "InlineWorker",
     "ObserverFailure",
     "Worker",
-    "check_rhythm",
     "deferred_interrupt",
-    "make_worker",
 ]
 
 V = TypeVar("V")
-
-_LATER = ("lockstep", "live")
 
 
 @dataclass(frozen=True)
@@ -73,6 +69,9 @@ class Worker(ABC):
         on_map: called with a `MapState` when the map has changed.
         failures: observers that were detached because they raised.
         interrupted: whether Ctrl-C ended the last `run`.
+        frames_dropped: frames that were never tracked, since tracking was behind (live).
+        jobs_skipped: keyframes that a stage never saw, since it was behind (live).
+        messages_dropped: what observers were not told, since one was slow (live).
     """
 
     def __init__(self, stages: Stages) -> None:
@@ -83,6 +82,7 @@ class Worker(ABC):
         self.on_map: list[Callable[[MapState], object]] = []
         self.failures: list[ObserverFailure] = []
         self.interrupted = False
+        self.frames_dropped = self.jobs_skipped = self.messages_dropped = 0
         self._told_version = stages.map.version
 
     @abstractmethod
@@ -94,7 +94,28 @@ class Worker(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Wait until all stages are at rest: nothing is written to the map after this returns."""
+        """Wait until all stages are at rest, and end their threads.
+
+        Nothing is written to the map after this returns; tracking may go on all the same.
+
+        Raises:
+            Exception: what a stage raised in its thread and nobody has been told yet.
+        """
+
+    def close(self) -> None:
+        """End the threads without writing what they still found; `finish` does more."""
+        return
+
+    def frames(
+        self, source: Iterable[Frame], interrupt: threading.Event
+    ) -> Generator[Frame, None, None]:
+        """Yield the frames to track: here, all of them as the source gives them.
+
+        Args:
+            source: frames in order of time.
+            interrupt: set where no more are wanted, though one is being waited for.
+        """
+        yield from source
 
     def track(self, frame: Frame) -> Estimate:
         """Take one frame through the stages, as far as the rhythm goes.
@@ -124,8 +145,11 @@ class Worker(ABC):
             Each frame and its estimate.
         """
         self.interrupted = False
-        with deferred_interrupt() as interrupt:
-            for frame in frames:
+        with (
+            deferred_interrupt() as interrupt,
+            closing(self.frames(frames, interrupt)) as wanted,
+        ):
+            for frame in wanted:
                 if not interrupt.is_set():
                     yield frame, self.advance(frame)
                 self.interrupted = interrupt.is_set()
@@ -183,37 +207,6 @@ class InlineWorker(Worker):
     def finish(self) -> None:
         """Do nothing but tell the last of the map: inline, every stage is at rest after a frame."""
         self._tell_map()
-
-
-RHYTHMS: Mapping[str, Callable[[Stages], Worker]] = MappingProxyType({"inline": InlineWorker})
-"""The rhythms there are, by name."""
-
-
-def check_rhythm(rhythm: str) -> None:
-    """Raise unless there is such a rhythm.
-
-    Raises:
-        ConfigError: it names those there are.
-    """
-    if rhythm not in RHYTHMS:
-        known = ", ".join(RHYTHMS)
-        why = "is not in this version" if rhythm in _LATER else "is unknown"
-        near = "" if rhythm in _LATER else nearest_name(rhythm, RHYTHMS)
-        raise ConfigError(f"rhythm: '{rhythm}' {why}{near}; use one of: {known}")
-
-
-def make_worker(rhythm: str, stages: Stages) -> Worker:
-    """Return a worker of the rhythm asked for.
-
-    Args:
-        rhythm: one of `RHYTHMS`.
-        stages: the agents of the run.
-
-    Raises:
-        ConfigError: if this version has no such rhythm.
-    """
-    check_rhythm(rhythm)
-    return RHYTHMS[rhythm](stages)
 
 
 @contextmanager

@@ -1,0 +1,159 @@
+"""Beside the tracker: a stage whose jobs are solved in a thread of its own, one at a time.
+
+What a stage reads from the map and what it writes to it runs in the thread of the tracker, between
+two frames, so that no frame sees the map change under its feet and every order of events is that
+of the code. Only what lies between, `Job.solve` on arrays that are its own, runs in the thread:
+
+    tracker's thread   start (add reads) ──────── frames ────────▶ collect, change.write
+    stage's thread              └──── solve: compiled, without the GIL ────┘
+
+When to collect is all that the rhythms differ in. Python hands its lock from thread to thread every
+5 ms at best; while threads run, that is shortened, or a tracker made of many short steps would wait
+for it at each (`quick_switching`).
+
+Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR workspaces, 2007.
+"""
+
+import sys
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from odomap.limits import Count, Limits, check_limits
+from odomap.maps.keyframes import Keyframe
+from odomap.system.stages import Change, Closer, Mapper
+
+__all__ = ["Lane", "QuickSwitching", "ThreadConfig"]
+
+Frames = Annotated[int, Limits(least=0)]
+
+
+@dataclass(frozen=True)
+class ThreadConfig:
+    """When stages beside the tracker hand in what they found (lockstep, live)."""
+
+    mapping_delay: Frames = 1
+    """Lockstep: frames from a keyframe to the one that sees the map adjusted around it. With 1, the
+    next frame does, and the mapper works while it is read; 0 works inline."""
+    closing_delay: Frames = 20
+    """Lockstep: frames from the search for a loop to the one that sees the path corrected."""
+    queue: Count = 2
+    """Live: frames that may wait for the tracker; beyond them the oldest is dropped."""
+    messages: Count = 256
+    """Live: what may wait for a slow observer; beyond it the oldest is dropped."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+class QuickSwitching:
+    """Shortens the interval at which Python's threads take turns, while anybody wants that.
+
+    The interval belongs to the process, and so does the count of those who want it short: the last
+    one to release it puts back what was there before the first.
+    """
+
+    INTERVAL_S: ClassVar[float] = 0.0005
+    _lock: ClassVar[threading.Lock] = threading.Lock()
+    _holders: ClassVar[int] = 0
+    _before: ClassVar[float] = 0.0
+
+    def __init__(self) -> None:
+        self._holds = False
+
+    def hold(self) -> None:
+        """Shorten the interval; a second call does nothing."""
+        cls = QuickSwitching
+        with cls._lock:
+            if self._holds:
+                return
+            if cls._holders == 0:
+                cls._before = sys.getswitchinterval()
+                sys.setswitchinterval(min(cls._before, cls.INTERVAL_S))
+            self._holds = True
+            cls._holders += 1
+
+    def release(self) -> None:
+        """Put back what was there, unless another one still holds it."""
+        cls = QuickSwitching
+        with cls._lock:
+            if not self._holds:
+                return
+            self._holds = False
+            cls._holders -= 1
+            if cls._holders == 0:
+                sys.setswitchinterval(cls._before)
+
+
+class Lane:
+    """A stage beside the tracker, with at most one job out.
+
+    Args:
+        name: for timing and for the thread.
+        stage: mapper or closer.
+
+    Attributes:
+        name: of the lane.
+        keyframe: the one whose job is out, or None.
+    """
+
+    def __init__(self, name: str, stage: Mapper | Closer) -> None:
+        self.name, self._stage = name, stage
+        self.keyframe: Keyframe | None = None
+        self._future: Future[Change] | None = None
+        self._thread: ThreadPoolExecutor | None = None
+
+    @property
+    def is_out(self) -> bool:
+        """Whether a job is out."""
+        return self._future is not None
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether a job is out whose change, or whose error, is there."""
+        return self._future is not None and self._future.done()
+
+    def start(self, keyframe: Keyframe) -> bool:
+        """Let the stage read the map, and solve what it found to do in its thread.
+
+        Args:
+            keyframe: a new one; the job of the last must have been collected.
+
+        Returns:
+            Whether there is something to do.
+        """
+        assert self._future is None, f"{self.name}: a job is out"
+        job = self._stage.add(keyframe)
+        if job is None:
+            return False
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
+        self.keyframe, self._future = keyframe, self._thread.submit(job.solve)
+        return True
+
+    def collect(self) -> tuple[Keyframe, Change]:
+        """Wait for the job that is out.
+
+        Returns:
+            Its keyframe, and the change to write.
+
+        Raises:
+            Exception: what the stage raised; the job is not out any more.
+        """
+        assert self._future is not None, f"{self.name}: no job is out"
+        assert self.keyframe is not None
+        keyframe, future = self.keyframe, self._future
+        try:
+            change = future.result()
+        finally:
+            if future.done():  # else Ctrl-C was pressed while waiting: it is still out
+                self.keyframe, self._future = None, None
+        return keyframe, change
+
+    def close(self) -> None:
+        """End the thread and forget the job that is out; a later start makes a new one."""
+        self.keyframe, self._future = None, None
+        if self._thread is not None:
+            self._thread.shutdown(wait=True)
+            self._thread = None
