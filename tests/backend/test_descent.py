@@ -120,3 +120,7 @@ def test_limits_are_checked():
         SolverConfig(iterations=-1)
     with pytest.raises(ConfigError):
         SolverConfig(damping=0.0)
+    with pytest.raises(ConfigError, match="'newton' is unknown"):
+        SolverConfig(method="newton")
+    with pytest.raises(ConfigError, match="whole number"):
+        SolverConfig(iterations=2.5)

@@ -28,12 +28,14 @@ from numpy.typing import NDArray
 
 from odomap.backend.sparse.blockcholesky import BlockCholesky
 from odomap.backend.sparse.blocks import BlockPattern
+from odomap.errors import ConfigError
 from odomap.limits import Limits, NotNegative, Positive, check_limits
 
 __all__ = ["Descent", "IterationRecord", "Linear", "Method", "Problem", "SolverConfig", "descend"]
 
 Array = NDArray[np.float64]
 Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg"]
+METHODS = ("gauss_newton", "levenberg_marquardt", "dogleg")
 X = TypeVar("X")
 
 _ZERO = 1e-300
@@ -56,6 +58,10 @@ class SolverConfig:
 
     def __post_init__(self) -> None:
         check_limits(self)
+        if self.method not in METHODS:
+            raise ConfigError(f"method: '{self.method}' is unknown, give {', '.join(METHODS)}")
+        if not isinstance(self.iterations, int | np.integer):
+            raise ConfigError(f"iterations: {self.iterations} must be a whole number")
 
 
 @dataclass(frozen=True)

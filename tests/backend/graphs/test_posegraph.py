@@ -59,6 +59,12 @@ def reflected():
     return T
 
 
+def lower():
+    matrix = np.zeros((3, 3))
+    matrix[2, 0] = 5.0
+    return matrix
+
+
 nan = np.full((3, 3), np.nan)
 
 WRONG = {
@@ -79,14 +85,20 @@ WRONG = {
         "information": [I3, np.diag([1.0, -2.0, 1.0])]
     },
     "node 10 is to be held, but its pose is not known": {"is_fixed": [True, False, False]},
-    "node 11: not a rotation": {"Ts_world_node": np.stack([I3, 2 * I3, I3])},
+    "node 11: not a rotation": {"Ts_world_node": np.stack([I3, np.diag([2.0, 2.0, 1.0]), I3])},
     "prior 0: its information is indefinite": {
         "priors": Priors(np.array([0]), I3[None], -I3[None])
     },
-    "prior 0: not a rotation": {"priors": Priors(np.array([0]), 3 * I3[None], I3[None])},
+    "prior 0: not a rotation": {
+        "priors": Priors(np.array([0]), np.diag([3.0, 3.0, 1.0])[None], I3[None])
+    },
     "priors.node names a node or landmark that does not exist": {
         "priors": Priors(np.array([7]), I3[None], I3[None])
     },
+    "node 12: the last row must be 0 … 0 1": {"Ts_world_node": np.stack([I3, I3, I3 + lower()])},
+    "two nodes are called 7: ids must differ": {"ids": [7, 8, 7]},
+    "information is not an array of numbers": {"information": [[1.0], [2.0, 3.0]]},
+    "priors must be given as `Priors`": {"priors": (np.array([0]), I3[None], I3[None])},
     "a sight of a landmark is not finite": {
         "points": Sights(
             np.zeros((1, 2)),
@@ -115,3 +127,15 @@ def test_a_similarity_may_have_any_scale():
     scaled = g.Ts_first_second.copy()
     scaled[:, :3, :3] *= 7.0
     assert PoseGraph("Sim3", Ts, g.first, g.second, scaled, g.information).group == "Sim3"
+
+
+def test_what_the_caller_writes_later_changes_nothing():
+    information = np.stack([I3, I3])
+    g = graph(information=information)
+    information[:] = -5.0
+    assert (g.information == I3).all()
+
+
+def test_ids_may_be_far_apart():
+    lowest, highest = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    assert graph(ids=[lowest, highest, 5]).is_loop.all()

@@ -11,7 +11,7 @@ from odomap.backend.descent import IterationRecord, SolverConfig
 from odomap.backend.graphs.chordal import chordal_cost
 from odomap.backend.graphs.posegraph import PoseGraph, Priors
 from odomap.backend.graphs.solve import solve
-from odomap.errors import InputError
+from odomap.errors import ConfigError, InputError
 
 each_group = pytest.mark.parametrize("group", DIM)
 each_rigid = pytest.mark.parametrize("group", ["SE2", "SE3"])
@@ -179,6 +179,53 @@ def test_directions_without_information_are_left_alone():
     assert solution.cost_after < 1e-6
 
 
+@each_rigid
+def test_auto_begins_at_given_poses_that_landmarks_confirm(group):
+    """Odometry that drifts, and landmarks that know better: what is given is the better start."""
+    graph, truth = world(group, count=60, loops=0, noise=0.2)
+    graph, _ = with_landmarks(graph, truth, count=40, noise=0.01)
+    graph = graph.placed(
+        truth, solve(graph.placed(truth), initial="given").graph.points.points_world
+    )
+    solution = solve(graph)
+    assert solution.initial == "given"
+    assert solution.cost_after <= solve(graph, initial="chordal").cost_after * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("name", ["tukey", "dcs", "geman_mcclure", "huber"])
+def test_a_solved_graph_stays_solved_under_a_loss(name):
+    graph, _ = world("SE2", count=80, loops=30, noise=0.05)
+    solution = solve(graph)
+    again = solve(solution.graph, loss=name)
+    # No loop is false: hardly any is let go (constants are for one number, loops have three).
+    assert again.is_rejected.sum() <= 2
+    assert distances("SE2", again.Ts_world_node, solution.Ts_world_node).max() < 0.5
+
+
+def test_an_edge_without_information_ties_nothing():
+    graph, _ = world("SE3", count=6, loops=0)
+    information = graph.information.copy()
+    information[2] = 0.0
+    solution = solve(replace(graph, information=information))
+    assert solution.num_components == 2
+    assert not solution.is_rejected.any()
+
+
+def test_a_prior_without_information_holds_nothing():
+    graph, truth = world("SE3", count=6, loops=2)
+    prior = Priors(np.array([3]), truth[[3]] @ EXP["SE3"](np.ones(6)), np.zeros((1, 6, 6)))
+    solution = solve(replace(graph, priors=prior))
+    np.testing.assert_array_equal(solution.Ts_world_node[0], np.eye(4))
+    assert solution.converged
+
+
+def test_what_one_gives_a_low_weight_is_not_called_false():
+    graph, _ = world("SE2")
+    assert not solve(graph, weights=np.full(graph.num_edges, 0.3)).is_rejected.any()
+    left_out = np.where(graph.is_loop, 0.0, 1.0)
+    assert not solve(graph, weights=left_out).is_rejected.any()
+
+
 def test_what_cannot_be_solved_is_refused():
     empty = PoseGraph("SE2", np.zeros((0, 3, 3)), [], [], np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
     with pytest.raises(InputError, match="nothing to solve"):
@@ -192,6 +239,10 @@ def test_what_cannot_be_solved_is_refused():
         solve(graph, weights=np.full(54, np.nan))
     with pytest.raises(InputError, match="'geodetic' is unknown"):
         solve(graph, cost="geodetic")
+    with pytest.raises(InputError, match="initial 'random' is unknown"):
+        solve(graph, initial="random")
+    with pytest.raises(ConfigError, match="'hubr' is unknown"):
+        solve(graph, loss="hubr")
     with pytest.raises(InputError, match="use geodesic for Sim3"):
         solve(world("Sim3")[0], cost="chordal")
 

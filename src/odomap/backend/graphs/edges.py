@@ -52,18 +52,16 @@ class EdgeArrays(NamedTuple):
 
 
 class TargetArrays(NamedTuple):
-    """Where to write: column (N,) of each node or -1, values of H, and offsets into them.
+    """Where to write: values of H and g, and where in them nodes and pairs are.
 
     Attributes:
-        column: (N,) block of each node, -1 where it is held.
         pair: (E,) offset in `values` of each edge's block, -1 if a node of it is held.
         diagonal: (N,) offset in `values` of each node's own block.
-        row: (N,) first row of each node.
+        row: (N,) first row of each node, -1 where it is held.
         values: (V,) of H.
         gradient: (n,).
     """
 
-    column: Index
     pair: Index
     diagonal: Index
     row: Index
@@ -73,22 +71,22 @@ class TargetArrays(NamedTuple):
 
 @kernel(reorder=True)
 def relative_motion(
-    tangent: Size, T_i: Array, T_j: Array, Z_inverse: Array, D: Array, E: Array
+    tangent: Size, Ts: Array, i: int, j: int, Zs_inverse: Array, e: int, D: Array, E: Array
 ) -> None:
-    """D = T_i⁻¹ T_j and E = Z⁻¹ D, rigid motions of the plane (3, 3) or of space (4, 4)."""
+    """D = T_i⁻¹ T_j and E = Z_e⁻¹ D, rigid motions of the plane (3, 3) or of space (4, 4)."""
     d = 2 if len(tangent) == 3 else 3
     for a in range(d):
         for b in range(d + 1):
             total = 0.0
             for c in range(d):
-                moved = T_j[c, b] - T_i[c, b] if b == d else T_j[c, b]
-                total += T_i[c, a] * moved
+                moved = Ts[j, c, b] - Ts[i, c, b] if b == d else Ts[j, c, b]
+                total += Ts[i, c, a] * moved
             D[a, b] = total
     for a in range(d):
         for b in range(d + 1):
-            total = Z_inverse[a, d] if b == d else 0.0
+            total = Zs_inverse[e, a, d] if b == d else 0.0
             for c in range(d):
-                total += Z_inverse[a, c] * D[c, b]
+                total += Zs_inverse[e, a, c] * D[c, b]
             E[a, b] = total
 
 
@@ -148,7 +146,7 @@ def log_of_error(tangent: Size, E: Array, R: Array, t: Array, r: Array) -> None:
 
 @kernel(reorder=True)
 def _geodesic(
-    tangent: Size, r: Array, information: Array, J: Array, WJ: Array, A: Array, b: Array
+    tangent: Size, r: Array, information: Array, e: int, J: Array, WJ: Array, A: Array, b: Array
 ) -> float:
     """A = Jᵀ Ω J, b = Jᵀ Ω r; return rᵀ Ω r."""
     k, chi2 = len(tangent), 0.0
@@ -159,14 +157,14 @@ def _geodesic(
     for p in range(k):
         total = 0.0
         for q in range(k):
-            total += information[p, q] * r[q]
+            total += information[e, p, q] * r[q]
         chi2 += r[p] * total
         b[p] = total
         for q in range(k):
             WJ[p, q] = 0.0
         for c in range(k):
             for q in range(k):
-                WJ[p, q] += information[p, c] * J[c, q]
+                WJ[p, q] += information[e, p, c] * J[c, q]
     for p in range(k):
         for q in range(k):
             A[p, q] = 0.0
@@ -213,25 +211,30 @@ def _chordal(tangent: Size, E: Array, kappa: float, tau: float, A: Array, b: Arr
 @kernel(reorder=True)
 def scatter(
     tangent: Size,
-    e: int,
-    i: int,
-    j: int,
     w: float,
+    rows: tuple[int, int],
+    places: tuple[int, int, int],
     A: Array,
     b: Array,
     M: Array,
     MA: Array,
-    into: TargetArrays,
+    values: Array,
+    gradient: Array,
 ) -> None:
-    """Add w times an edge's A, b to H and g at its nodes; MA is room for Mᵀ A."""
-    k, values, gradient = len(tangent), into.values, into.gradient
-    if into.column[j] >= 0:
-        row, at = into.row[j], into.diagonal[j]
+    """Add w times an edge's A, b to H and g at its nodes; MA is room for Mᵀ A.
+
+    `rows` are those of i and j, -1 where held; `places` are of H_ii, H_jj and the pair, which is
+    H_ij if row i comes first, else H_ji.
+    """
+    k = len(tangent)
+    row_i, row_j = rows
+    at_i, at_j, pair = places
+    if row_j >= 0:
         for p in range(k):
-            gradient[row + p] += w * b[p]
+            gradient[row_j + p] += w * b[p]
             for q in range(k):
-                values[at + k * p + q] += w * A[p, q]
-    if into.column[i] < 0:
+                values[at_j + k * p + q] += w * A[p, q]
+    if row_i < 0:
         return
     for p in range(k):
         for q in range(k):
@@ -240,25 +243,23 @@ def scatter(
         for p in range(k):
             for q in range(k):
                 MA[p, q] += M[c, p] * A[c, q]
-    row, at = into.row[i], into.diagonal[i]
     for p in range(k):
         total = 0.0
         for c in range(k):
             total += M[c, p] * b[c]
             for q in range(k):
-                values[at + k * p + q] += w * MA[p, c] * M[c, q]
-        gradient[row + p] -= w * total
-    at = into.pair[e]
-    if at < 0:
+                values[at_i + k * p + q] += w * MA[p, c] * M[c, q]
+        gradient[row_i + p] -= w * total
+    if pair < 0:
         return
-    if into.column[i] < into.column[j]:
+    if row_i < row_j:
         for p in range(k):
             for q in range(k):
-                values[at + k * p + q] -= w * MA[p, q]
+                values[pair + k * p + q] -= w * MA[p, q]
     else:
         for p in range(k):
             for q in range(k):
-                values[at + k * q + p] -= w * MA[p, q]
+                values[pair + k * q + p] -= w * MA[p, q]
 
 
 @kernel
@@ -278,26 +279,36 @@ def linearise_edges(
     D, E, R, t = np.eye(m), np.eye(m), np.empty((3, 3)), np.empty(3)
     r, b, J, WJ = np.empty(k), np.empty(k), np.empty((k, k)), np.empty((k, k))
     A, M, MA = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
+    # Fields read once: inside the loop each would cost a count of references.
+    first, second, Zs, weights = edges.first, edges.second, edges.Ts_inverse, edges.weight
+    information, is_robust = edges.information, edges.is_robust
+    row, diagonal, pair, values, gradient = (
+        into.row,
+        into.diagonal,
+        into.pair,
+        into.values,
+        into.gradient,
+    )
     cost = 0.0
-    for e in range(len(edges.first)):
-        i, j = edges.first[e], edges.second[e]
-        relative_motion(tangent, Ts[i], Ts[j], edges.Ts_inverse[e], D, E)
+    for e in range(len(first)):
+        i, j = first[e], second[e]
+        relative_motion(tangent, Ts, i, j, Zs, e, D, E)
         if is_chordal:
-            kappa, tau = edges.information[e, 0, 0], edges.information[e, 0, 1]
-            s = _chordal(tangent, E, kappa, tau, A, b)
+            s = _chordal(tangent, E, information[e, 0, 0], information[e, 0, 1], A, b)
         else:
             log_of_error(tangent, E, R, t, r)
-            s = _geodesic(tangent, r, edges.information[e], J, WJ, A, b)
+            s = _geodesic(tangent, r, information, e, J, WJ, A, b)
         chi2[e] = s
-        w = edges.weight[e]
-        if edges.is_robust[e]:
+        w = weights[e]
+        if is_robust[e]:
             cost += 0.5 * w * loss_cost(loss, width, s)
             w *= loss_weight(loss, width, s)
         else:
             cost += 0.5 * w * s
         if w > 0.0:
             adjoint_of_inverse(tangent, D, M)
-            scatter(tangent, e, i, j, w, A, b, M, MA, into)
+            places = (diagonal[i], diagonal[j], pair[e])
+            scatter(tangent, w, (row[i], row[j]), places, A, b, M, MA, values, gradient)
     return cost
 
 
@@ -315,9 +326,11 @@ def cost_of_edges(
     k = len(tangent)
     m = 3 if k == 3 else 4
     D, E, R, t, r = np.eye(m), np.eye(m), np.empty((3, 3)), np.empty(3), np.empty(k)
+    first, second, Zs, weights = edges.first, edges.second, edges.Ts_inverse, edges.weight
+    information, is_robust = edges.information, edges.is_robust
     cost = 0.0
-    for e in range(len(edges.first)):
-        relative_motion(tangent, Ts[edges.first[e]], Ts[edges.second[e]], edges.Ts_inverse[e], D, E)
+    for e in range(len(first)):
+        relative_motion(tangent, Ts, first[e], second[e], Zs, e, D, E)
         s = 0.0
         if is_chordal:
             rotation = 0.0
@@ -326,15 +339,15 @@ def cost_of_edges(
                 for q in range(m - 1):
                     off = E[p, q] - (1.0 if p == q else 0.0)
                     rotation += off * off
-            s = 2.0 * (edges.information[e, 0, 0] * rotation + edges.information[e, 0, 1] * s)
+            s = 2.0 * (information[e, 0, 0] * rotation + information[e, 0, 1] * s)
         else:
             log_of_error(tangent, E, R, t, r)
             for p in range(k):
                 for q in range(k):
-                    s += r[p] * edges.information[e, p, q] * r[q]
+                    s += r[p] * information[e, p, q] * r[q]
         chi2[e] = s
-        rho = loss_cost(loss, width, s) if edges.is_robust[e] else s
-        cost += 0.5 * edges.weight[e] * rho
+        rho = loss_cost(loss, width, s) if is_robust[e] else s
+        cost += 0.5 * weights[e] * rho
     return cost
 
 
@@ -351,7 +364,6 @@ def warm_up() -> None:
                 first, second, Ts[:1], information, np.ones(1), np.zeros(1, np.bool_)
             )
             into = TargetArrays(
-                np.array([-1, 0]),
                 np.array([-1]),
                 np.array([-1, 0]),
                 np.array([-1, 0]),

@@ -24,7 +24,7 @@ from odomap.backend.graphs.edges import (
     linearise_edges,
 )
 from odomap.backend.graphs.posegraph import PoseGraph
-from odomap.backend.graphs.sights import SightArrays, SightTargets, linearise_sights
+from odomap.backend.graphs.sights import SightArrays, SightTargets, cost_of_sights, linearise_sights
 from odomap.backend.graphs.similarities import cost_of_similarities, linearise_similarities
 from odomap.backend.sparse.blockcholesky import BlockCholesky
 from odomap.backend.sparse.blocks import BlockPattern
@@ -113,9 +113,7 @@ class GraphProblem:
         """Write cost, H and g at x, and χ² of each edge and sight beside."""
         out.values[:] = 0.0
         out.gradient[:] = 0.0
-        into = TargetArrays(
-            self.column, self._edge_pair, self._diagonal, self._row, out.values, out.gradient
-        )
+        into = TargetArrays(self._edge_pair, self._diagonal, self._row, out.values, out.gradient)
         if self.graph.group == "Sim3":
             out.cost = linearise_similarities(x.Ts, self.edges, *self.loss, into, self.chi2)
         else:
@@ -148,6 +146,13 @@ class GraphProblem:
         return float(
             cost_of_edges(self.tangent, x.Ts, self.edges, self.is_chordal, *self.loss, self.chi2)
         )
+
+    def cost(self, x: GraphState) -> float:
+        """Return the cost of edges, priors and sights at x, and write χ² of each."""
+        cost = self.cost_of_edges(x)
+        if len(self.sights.node):
+            cost += cost_of_sights(x.Ts, x.points, self.sights, *self.loss, self.chi2_of_sights)
+        return cost
 
     def state(self, Ts_world_node: Array, points_world: Array) -> GraphState:
         """Return poses (N, m, m) and landmarks (M, d) as a state."""

@@ -33,7 +33,7 @@ from odomap.backend.sparse.blocks import BlockPattern
 from odomap.errors import InputError
 from odomap.kernels import kernel
 
-__all__ = ["chordal", "place_landmarks", "spanning_tree", "warm_up"]
+__all__ = ["chordal", "node_factor", "place_landmarks", "spanning_tree", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -68,12 +68,15 @@ def spanning_tree(graph: PoseGraph, weights: Array | None = None) -> Array:
     return fit_to_priors(graph, follow_tree(graph, components, weights), components)
 
 
-def chordal(graph: PoseGraph, order: Index | None = None, weights: Array | None = None) -> Array:
+def chordal(
+    graph: PoseGraph, factor: BlockCholesky | None = None, weights: Array | None = None
+) -> Array:
     """Place the nodes of a graph by the relaxed chordal cost: rotations, scales, positions.
 
     Args:
         graph: of poses; of those it holds only fixed nodes and anchors count.
-        order: (N,) elimination order of the nodes; approximate minimum degree unless given.
+        factor: room for the factor of one unknown per node (`node_factor`), if there is one; its
+            order serves all systems.
         weights: (E,) of its edges; edges of weight 0 are left out.
 
     Returns:
@@ -90,7 +93,7 @@ def chordal(graph: PoseGraph, order: Index | None = None, weights: Array | None 
     kappa, tau = (
         _with_trace(w, weights) for w in isotropic_weights(graph.information, graph.space)
     )
-    relaxed = _Relaxation(graph, held, order)
+    relaxed = _Relaxation(graph, held, node_factor(graph) if factor is None else factor)
     scale_known, R_known = _scale_and_rotation(known, graph)
     scale_edge, R_edge = _scale_and_rotation(Zs, graph)
     R = relaxed.rotations(R_edge, kappa, R_known)
@@ -107,6 +110,12 @@ def chordal(graph: PoseGraph, order: Index | None = None, weights: Array | None 
     out[:, :d, d] = relaxed.along(steps, tau, known[:, :d, d])
     out[held] = Ts[held]
     return fit_to_priors(graph, out, components)
+
+
+def node_factor(graph: PoseGraph) -> BlockCholesky:
+    """Return room for the factor of a matrix with one row per node, and an entry per edge."""
+    nodes = np.ones(graph.num_nodes, np.int64)
+    return BlockCholesky(BlockPattern.of(nodes, graph.first, graph.second))
 
 
 def place_landmarks(graph: PoseGraph, Ts_world_node: Array) -> Array:
@@ -163,12 +172,10 @@ def _scale_and_rotation(Ts: Array, graph: PoseGraph) -> tuple[Array, Array]:
 class _Relaxation:
     """The linear systems of a graph, some nodes held: one pattern and order, two block sizes."""
 
-    def __init__(self, graph: PoseGraph, held: Bool, order: Index | None) -> None:
-        n = graph.num_nodes
+    def __init__(self, graph: PoseGraph, held: Bool, factor: BlockCholesky) -> None:
         self.ends, self.held, self.space = (graph.first, graph.second), held, graph.space
-        self.pattern = BlockPattern.of(np.ones(n), *self.ends)
+        self.pattern, self.factor = factor.pattern, factor
         self.pair = self.pattern.pair_of(*self.ends)
-        self.factor = BlockCholesky(self.pattern, order)
 
     def rotations(self, Zs: Array, kappa: Array, known: Array) -> Array:
         """Return R (N, d, d), given those of edges (E, d, d), κ (E,) and R of nodes held."""

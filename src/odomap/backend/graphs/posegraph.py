@@ -84,7 +84,7 @@ class Sights:
     information: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseGraph:
     """A pose graph, as arrays.
 
@@ -150,6 +150,11 @@ class PoseGraph:
         n, e = self.num_nodes, self.num_edges
         if not (len(self.ids) == len(self.is_fixed) == n):
             raise InputError(f"pose graph: ids and is_fixed must have one entry per node ({n})")
+        in_order = np.sort(self.ids)
+        twice = in_order[1:] == in_order[:-1]
+        if twice.any():
+            name = in_order[1:][np.argmax(twice)]
+            raise InputError(f"pose graph: two nodes are called {name}: ids must differ")
         if not (len(self.second) == len(self.Ts_first_second) == len(self.information) == e):
             raise InputError("pose graph: edge arrays differ in length")
         loops = np.flatnonzero(self.first == self.second)
@@ -195,7 +200,8 @@ class PoseGraph:
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """(E,) whether an edge ties nodes that do not follow each other by name."""
-        return np.asarray(np.abs(self.ids[self.first] - self.ids[self.second]) != 1)
+        i, j = self.ids[self.first], self.ids[self.second]
+        return np.asarray(np.maximum(i, j) - np.minimum(i, j) != 1)
 
     @property
     def positions(self) -> Array:
@@ -210,6 +216,12 @@ class PoseGraph:
             other._set("points", replace(self.points, points_world=points_world))
         return other
 
+    def with_priors(self, priors: Priors) -> Self:
+        """Return the same graph with other priors, unchecked."""
+        other = copy.copy(self)
+        other._set("priors", priors)
+        return other
+
     def without(self, edges: NDArray[np.bool_]) -> Self:
         """Return the graph without the edges marked (E,); what is left needs no second check."""
         other, keep = copy.copy(self), ~np.asarray(edges, bool)
@@ -220,7 +232,10 @@ class PoseGraph:
 
 
 def _reals(values: ArrayLike, tail: tuple[int, ...], name: str) -> Array:
-    array = np.ascontiguousarray(values, np.float64)
+    try:
+        array = np.array(values, np.float64, order="C")
+    except (TypeError, ValueError):
+        raise InputError(f"pose graph: {name} is not an array of numbers") from None
     if array.size == 0:
         return np.zeros((0, *tail))
     if array.ndim != len(tail) + 1 or array.shape[1:] != tail:
@@ -230,9 +245,14 @@ def _reals(values: ArrayLike, tail: tuple[int, ...], name: str) -> Array:
 
 
 def _indices(values: ArrayLike, count: int | None, name: str) -> Index:
-    array = np.ascontiguousarray(values)
+    try:
+        array = np.array(values)
+    except (TypeError, ValueError):
+        array = np.zeros((0, 0))
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise InputError(f"pose graph: {name} must be a list of whole numbers")
+    if array.size and array.max() > np.iinfo(np.int64).max:
+        raise InputError(f"pose graph: {name} holds a number beyond 2^63")
     array = array.astype(np.int64)
     if count is not None and array.size and not 0 <= array.min() <= array.max() < count:
         raise InputError(f"pose graph: {name} names a node or landmark that does not exist")
@@ -241,6 +261,8 @@ def _indices(values: ArrayLike, count: int | None, name: str) -> Index:
 
 def _checked_priors(priors: Priors | None, n: int, size: GroupSize) -> Priors:
     m, k = size.space + 1, size.dim
+    if not isinstance(priors, Priors | None):
+        raise InputError("pose graph: priors must be given as `Priors`")
     if priors is None:
         return Priors(np.zeros(0, np.int64), np.zeros((0, m, m)), np.zeros((0, k, k)))
     node = _indices(priors.node, n, "priors.node")
@@ -255,6 +277,8 @@ def _checked_priors(priors: Priors | None, n: int, size: GroupSize) -> Priors:
 
 def _checked_points(points: Sights | None, n: int, size: GroupSize) -> Sights:
     d = size.space
+    if not isinstance(points, Sights | None):
+        raise InputError("pose graph: points must be given as `Sights`")
     if points is None:
         none = np.zeros(0, np.int64)
         return Sights(np.zeros((0, d)), none, none, none, np.zeros((0, d)), np.zeros((0, d, d)))
@@ -286,6 +310,10 @@ def _check_transforms(Ts: Array, name: Namer, group: str) -> None:
     if not finite.all():
         raise InputError(f"pose graph: {name(int(np.argmin(finite)))}: a value is not finite")
     d = Ts.shape[1] - 1
+    skewed = (np.abs(Ts[:, d] - np.eye(d + 1)[d]) > 1e-9).any(axis=1)
+    if skewed.any():
+        which = int(np.argmax(skewed))
+        raise InputError(f"pose graph: {name(which)}: the last row must be 0 … 0 1")
     R = Ts[:, :d, :d]
     determinant = np.linalg.det(R)
     scale = np.cbrt(np.abs(determinant)) if group == "Sim3" else np.ones(len(Ts))

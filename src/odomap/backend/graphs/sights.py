@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from odomap.geometry.robust_kernels import loss_cost, loss_weight
 from odomap.kernels import kernel
 
-__all__ = ["SightArrays", "SightTargets", "linearise_sights", "warm_up"]
+__all__ = ["SightArrays", "SightTargets", "cost_of_sights", "linearise_sights", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -146,6 +146,21 @@ def linearise_sights(
     return cost
 
 
+@kernel
+def cost_of_sights(
+    Ts: Array, points: Array, sights: SightArrays, loss: int, width: float, chi2: Array
+) -> float:
+    """Return the cost of all sights, and write rᵀ Ω r of each."""
+    d, cost = points.shape[1], 0.0
+    q, r, Wr = np.empty(d), np.empty(d), np.empty(d)
+    for o in range(len(sights.node)):
+        m = sights.point[o]
+        residual(Ts[sights.node[o]], points[m], sights.measured[o], q, r)
+        chi2[o] = _quadratic(r, sights.information[o], Wr)
+        cost += 0.5 * loss_cost(loss, width, chi2[o])
+    return cost
+
+
 def warm_up() -> None:
     """Compile the kernels of this module."""
     zero, held = np.array([0]), np.array([-1])
@@ -155,3 +170,4 @@ def warm_up() -> None:
         sights = SightArrays(zero, zero, np.zeros((1, d)), np.eye(d)[None].copy())
         into = SightTargets(held, held, zero, zero, held, np.zeros(d * d), np.zeros(d))
         linearise_sights(Ts, points, sights, k, 0, 1.0, into, np.empty(1))
+        cost_of_sights(Ts, points, sights, 0, 1.0, np.empty(1))

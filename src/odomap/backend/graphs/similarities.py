@@ -83,7 +83,10 @@ def _accumulate(
         if edges.is_robust[e]:
             w *= loss_weight(loss, width, chi2[e])
         if w > 0.0:
-            scatter(tangent, e, edges.first[e], edges.second[e], w, A[e], b[e], M[e], MA, into)
+            i, j = edges.first[e], edges.second[e]
+            places = (into.diagonal[i], into.diagonal[j], into.pair[e])
+            rows = (into.row[i], into.row[j])
+            scatter(tangent, w, rows, places, A[e], b[e], M[e], MA, into.values, into.gradient)
     return float(_weigh(edges, loss, width, chi2))
 
 
@@ -93,5 +96,5 @@ def warm_up() -> None:
     edges = EdgeArrays(
         np.array([0]), np.array([1]), Ts[:1], np.eye(7)[None], np.ones(1), np.zeros(1, np.bool_)
     )
-    into = TargetArrays(held, held[:1], held, held, np.zeros(49), np.zeros(7))
+    into = TargetArrays(held[:1], held, held, np.zeros(49), np.zeros(7))
     linearise_similarities(Ts, edges, 0, 1.0, into, np.empty(1))

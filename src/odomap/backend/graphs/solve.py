@@ -1,8 +1,8 @@
 """Solving a pose graph: a start, a descent, and an honest account of both.
 
     components   each connected part of a graph may move freely: one node of each is held
-    start        the poses given, along a spanning tree, or chordal (`initialization`); "auto" takes
-                 the better of what is given and chordal by their cost
+    start        the poses given, along a spanning tree, or chordal; "auto" takes the better one of
+                 what is given and chordal (`start`)
     descent      Gauss-Newton, Levenberg-Marquardt or dogleg (`descent`), sparse and exact
     robust       a loss on the loop edges, or graduated non-convexity, which names the false ones
 
@@ -24,13 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from odomap.backend.descent import Descent, IterationRecord, SolverConfig, descend
 from odomap.backend.graphs.components import Components, find_components
-from odomap.backend.graphs.consensus import find_consensus
 from odomap.backend.graphs.gnc import GncConfig, find_inliers
 from odomap.backend.graphs.graphproblem import GraphProblem, GraphState
-from odomap.backend.graphs.initialization import chordal, place_landmarks, spanning_tree
-from odomap.backend.graphs.posegraph import PoseGraph
-from odomap.backend.sparse.blocks import BlockPattern
-from odomap.backend.sparse.ordering import approximate_minimum_degree
+from odomap.backend.graphs.initialization import node_factor
+from odomap.backend.graphs.posegraph import PoseGraph, Priors
+from odomap.backend.graphs.start import INITIALS, Initial, choose_start
 from odomap.errors import InputError
 from odomap.geometry.robust import Loss
 
@@ -38,9 +36,11 @@ __all__ = ["Cost", "Initial", "Solution", "Stop", "solve"]
 
 Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
-Index = NDArray[np.int64]
 Cost = Literal["geodesic", "chordal"]
-Initial = Literal["auto", "given", "spanning_tree", "chordal"]
+
+LET_GO = 0.1
+"""A loss that leaves an edge less than this share of its weight has found it to be false; Huber's
+never does, as its pull does not end."""
 
 
 class Stop(Protocol):
@@ -62,7 +62,9 @@ class Solution:
         converged: whether there was nothing left to gain.
         reason: why it stopped, in words.
         chi2: (E,) squared residual of each edge in standard deviations (chordal: twice its cost).
-        weights: (E,) by which each edge counted in the end, 0 where it was rejected.
+        weights: (E,) by which each edge counted in the end, times that of its loss.
+        is_rejected: (E,) edges found to be false: left out by "gnc", or let go by a loss.
+        sight_weights: (S,) by which each sight of a landmark counted in the end.
         num_components: connected parts; more than one cannot be placed relative to each other.
         initial: the start that was chosen.
         history: one record per step.
@@ -76,6 +78,8 @@ class Solution:
     reason: str
     chi2: Array
     weights: Array
+    is_rejected: Bool
+    sight_weights: Array
     num_components: int
     initial: str
     history: tuple[IterationRecord, ...] = field(repr=False)
@@ -85,18 +89,13 @@ class Solution:
         """(N, m, m) poses found."""
         return self.graph.Ts_world_node
 
-    @property
-    def is_rejected(self) -> Bool:
-        """(E,) edges that were found to be false."""
-        return np.asarray(self.weights < 0.5)
-
 
 def solve(
     graph: PoseGraph,
     *,
     cost: Cost = "geodesic",
     initial: Initial = "auto",
-    loss: Loss | None = None,
+    loss: Loss | str | None = None,
     robust: Literal["gnc"] | GncConfig | None = None,
     weights: ArrayLike | None = None,
     config: SolverConfig | None = None,
@@ -110,7 +109,7 @@ def solve(
         cost: "geodesic", of distances along the group, or "chordal", of SE-Sync, isotropic.
         initial: where to begin; "auto" takes the better of what is given and chordal; with a loss,
             chordal without the loops that no other confirms. "gnc" has a start of its own.
-        loss: robust loss of loop edges (`PoseGraph.is_loop`) and sights; default none.
+        loss: robust loss of loop edges (`PoseGraph.is_loop`) and sights, or its name; default none.
         robust: "gnc" finds false loop edges and leaves them out (`Solution.is_rejected`).
         weights: (E,) by which edges count; 0 leaves one out. Default 1.
         config: method and limits.
@@ -132,28 +131,31 @@ def solve(
         np.float64(1.0)
     """
     config = SolverConfig() if config is None else config
-    loss = Loss() if loss is None else loss
+    loss = Loss(loss) if isinstance(loss, str) else loss or Loss()
+    if initial not in INITIALS:
+        raise InputError(f"solve: initial '{initial}' is unknown, give {', '.join(INITIALS)}")
     w = _checked_weights(graph, weights, cost)
+    is_given = w > 0.0
     stopped = None if stop is None else stop.is_set
-    whole = graph
+    whole = _without_empty_priors(graph)
     if robust is not None:
-        whole, w = _without_false_loops(graph, w, loss, robust, stopped)
+        whole, w = _without_false_loops(whole, w, loss, robust, stopped)
         initial = "given"
     is_out = w == 0.0  # what does not count is not to cost anything either
     graph = whole.without(is_out) if is_out.any() else whole
     components = find_components(graph, through_landmarks=True)
     held = _held(graph, components)
-    is_robust = graph.is_loop if loss.name != "quadratic" else np.zeros(graph.num_edges, bool)
-    problem = GraphProblem(graph, held, cost == "chordal", loss, is_robust, w[w > 0.0])
-    order = _order(graph)
-    problem.analyse(order)
-    start, chosen = _start(graph, problem, initial, order)
+    is_robust = graph.is_loop & (loss.name != "quadratic")
+    problem = GraphProblem(graph, held, cost == "chordal", loss, is_robust, w[~is_out])
+    nodes = node_factor(graph)
+    problem.analyse(nodes.order)
+    start, chosen = choose_start(problem, initial, held, nodes)
     chosen = chosen if robust is None else "gnc"
     descent = descend(problem, start, config, stopped, progress)
     if is_out.any():
         is_robust = whole.is_loop & (loss.name != "quadratic")
         problem = GraphProblem(whole, held, cost == "chordal", loss, is_robust, w)
-    return _solution(problem, loss, descent, components.count, chosen)
+    return _solution(problem, loss, descent, components.count, chosen, is_given & is_out)
 
 
 def _without_false_loops(
@@ -180,10 +182,23 @@ def _checked_weights(graph: PoseGraph, weights: ArrayLike | None, cost: Cost) ->
         raise InputError(f"solve: cost '{cost}' is unknown, give geodesic or chordal")
     if cost == "chordal" and graph.group == "Sim3":
         raise InputError("solve: the chordal cost is for rigid motions; use geodesic for Sim3")
-    w = np.ones(graph.num_edges) if weights is None else np.array(weights, np.float64)
+    try:
+        w = np.ones(graph.num_edges) if weights is None else np.array(weights, np.float64)
+    except (TypeError, ValueError):
+        w = np.full(1, np.nan)
     if w.shape != (graph.num_edges,) or not (np.isfinite(w).all() and (w >= 0.0).all()):
         raise InputError(f"solve: weights must be {graph.num_edges} numbers of 0 or more")
-    return w
+    # An edge without information ties nothing, and must not seem to hold a graph together.
+    return np.where(graph.information.any(axis=(1, 2)), w, 0.0)
+
+
+def _without_empty_priors(graph: PoseGraph) -> PoseGraph:
+    """Return the graph without priors that have no information: they hold nothing."""
+    says = graph.priors.information.any(axis=(1, 2))
+    if says.all():
+        return graph
+    p = graph.priors
+    return graph.with_priors(Priors(p.node[says], p.Ts_world_node[says], p.information[says]))
 
 
 def _held(graph: PoseGraph, components: Components) -> Bool:
@@ -193,54 +208,21 @@ def _held(graph: PoseGraph, components: Components) -> Bool:
     return held
 
 
-def _order(graph: PoseGraph) -> Index:
-    """Return one elimination order (N,) of the nodes, which serves all systems of a graph."""
-    nodes = np.ones(graph.num_nodes, np.int64)
-    return approximate_minimum_degree(BlockPattern.of(nodes, graph.first, graph.second))
-
-
-def _start(
-    graph: PoseGraph, problem: GraphProblem, initial: Initial, order: Index
-) -> tuple[GraphState, str]:
-    """Return the state to begin at, and what it is."""
-    weights = problem.edges.weight[: graph.num_edges]
-    is_known = bool(np.isfinite(graph.Ts_world_node).all())
-    if initial == "given" and not is_known:
-        raise InputError("solve: initial 'given' asks for poses, and some are not known")
-    if initial == "spanning_tree":
-        return _placed(graph, problem, spanning_tree(graph, weights)), initial
-    if initial == "given":
-        return _placed(graph, problem, graph.Ts_world_node), initial
-    is_doubted = problem.edges.is_robust.any() and initial == "auto"
-    if is_doubted:
-        weights = weights * (~graph.is_loop | find_consensus(graph, weights).is_confirmed)
-    ours = _placed(graph, problem, chordal(graph, order, weights))
-    # A loss that lets go makes the poses of odometry look cheap: all loops are off, none counts.
-    if initial == "chordal" or is_doubted or not is_known:
-        return ours, "chordal"
-    given = _placed(graph, problem, graph.Ts_world_node)
-    is_better = problem.cost_of_edges(given) <= problem.cost_of_edges(ours)
-    return (given, "given") if is_better else (ours, "chordal")
-
-
-def _placed(graph: PoseGraph, problem: GraphProblem, Ts: Array) -> GraphState:
-    """Return poses as a state, landmarks that are not known placed where they were seen."""
-    return problem.state(Ts, place_landmarks(graph, Ts))
-
-
 def _solution(
     problem: GraphProblem,
     loss: Loss,
     descent: Descent[GraphState],
     num_components: int,
     initial: str,
+    is_left_out: Bool,
 ) -> Solution:
     """Return what was found, with χ² and weight of all edges, of those left out, too."""
-    problem.cost_of_edges(descent.x)
+    problem.cost(descent.x)
     edges = slice(0, problem.graph.num_edges)
     chi2, weights = problem.chi2[edges].copy(), problem.edges.weight[edges].copy()
     is_robust = problem.edges.is_robust[edges]
-    weights[is_robust] *= loss.weight(chi2[is_robust])
+    by_loss = np.where(is_robust, loss.weight(chi2), 1.0)
+    is_let_go = (by_loss < LET_GO) & (loss.name != "huber")
     return Solution(
         problem.graph.placed(descent.x.Ts[:-1], descent.x.points),
         descent.cost_before,
@@ -249,7 +231,9 @@ def _solution(
         descent.converged,
         descent.reason,
         chi2,
-        weights,
+        weights * by_loss,
+        is_left_out | is_let_go,
+        loss.weight(problem.chi2_of_sights),
         num_components,
         initial,
         descent.history,

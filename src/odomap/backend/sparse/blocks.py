@@ -111,7 +111,8 @@ class BlockPattern:
         low, high = _ordered(i, j)
         n = len(sizes)
         _check_range(n, low, high)
-        keys = np.unique((low * n + high)[low != high])
+        keys = np.sort((low * n + high)[low != high])
+        keys = keys[np.append(True, keys[1:] != keys[:-1])[: len(keys)]]
         return cls(sizes, keys // max(n, 1), keys % max(n, 1))
 
     def pair_of(self, i: ArrayLike, j: ArrayLike) -> Index:
