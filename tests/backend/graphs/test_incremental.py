@@ -5,6 +5,7 @@ import threading
 import numpy as np
 import pytest
 
+from odomap.backend.descent import SolverConfig
 from odomap.backend.graphs.incremental import IncrementalConfig, IncrementalPoseGraph
 from odomap.backend.graphs.solve import solve
 from odomap.errors import ConfigError, InputError
@@ -82,8 +83,6 @@ def test_as_good_as_solving_all_of_it(group):
 
 def exact_cost(graph, k):
     """Return the cost at a graph's poses."""
-    from odomap.backend.descent import SolverConfig
-
     return solve(graph, initial="given", config=SolverConfig(iterations=0)).cost_before
 
 
@@ -145,6 +144,58 @@ def test_a_false_loop_under_a_loss():
     grow(graph, sorted(edges, key=lambda edge: edge[1]), np.eye(3) / 0.02**2)
     away = np.linalg.norm(graph.Ts_world_node[:, :2, 2] - truth[:, :2, 2], axis=1)
     assert away.max() < 0.2
+
+
+def ring_with_chords(nodes, rng):
+    """Return steps of a ring, and loops across its gap, measured with noise."""
+    xi = np.array([1.0, 0.0, 2 * np.pi / nodes])
+    truth = np.array([se2_exp(i * xi) for i in range(nodes)])
+
+    def measured(i, j):
+        error = se2_exp(0.05 * np.array([1.0, 1.0, 0.3]) * rng.normal(size=3))
+        return i, j, se2_inverse(truth[i]) @ truth[j] @ error
+
+    return [measured(i - 1, i) for i in range(1, nodes)], [
+        measured(nodes - 1 - i, i) for i in range(8)
+    ]
+
+
+@pytest.mark.parametrize("name", ["tukey", "truncated", "geman_mcclure", "dcs", "cauchy"])
+def test_loops_that_a_loss_lets_go_of_are_won_back_when_others_confirm_them(name):
+    rng = np.random.default_rng(0)
+    steps, loops = ring_with_chords(60, rng)
+    information = np.diag([100.0, 100.0, 400.0])
+    graph = IncrementalPoseGraph("SE2", loss=Loss(name))
+    for i in range(60):
+        graph.add_node()
+        if i:
+            graph.add_edge(*steps[i - 1], information)
+            graph.update()
+    false = (30, 10, np.eye(3)), (45, 20, STEP), (50, 5, STEP)
+    for loop in (false[0], *loops[:4], false[1], *loops[4:], false[2]):
+        graph.add_edge(*loop, information)
+        assert graph.update().converged
+    batch = solve(graph.graph(), loss=Loss(name))
+    assert graph.cost == pytest.approx(batch.cost_after, rel=0.01)
+    now = graph.graph()
+    residuals = solve(now, loss=Loss(name), initial="given", config=SolverConfig(iterations=0))
+    is_false = np.isin(np.arange(now.num_edges), [59, 64, 69])
+    np.testing.assert_array_equal(residuals.is_rejected, is_false)
+
+
+def test_a_false_loop_alone_is_let_go():
+    rng = np.random.default_rng(1)
+    steps, _ = ring_with_chords(60, rng)
+    graph = IncrementalPoseGraph("SE2", loss=Loss("tukey"))
+    for i in range(60):
+        graph.add_node()
+        if i:
+            graph.add_edge(*steps[i - 1], 100.0 * np.eye(3))
+    graph.update()
+    before = graph.Ts_world_node
+    graph.add_edge(30, 10, np.eye(3), 100.0 * np.eye(3))
+    assert graph.update().scope == "whole"  # a window alone cannot tell
+    np.testing.assert_allclose(graph.Ts_world_node, before, atol=1e-6)
 
 
 def test_parts_come_together_as_wholes():
@@ -245,10 +296,11 @@ NAN, INDEFINITE = np.full((3, 3), np.nan), np.diag([1.0, 1.0, -1.0])
     [
         (lambda g: g.add_node(node=1), "node 1 is there already"),
         (lambda g: g.add_node(NAN), "node 3: a value is not finite"),
-        (lambda g: g.add_node(2 * np.eye(3)), "node 3: not a rotation"),
+        (lambda g: g.add_node(np.diag([2.0, 2.0, 1.0])), "node 3: not a rotation"),
         (lambda g: g.add_node(np.eye(4)), "shape"),
         (lambda g: g.add_node(is_fixed=True), "node 3 is to be held"),
         (lambda g: g.add_node(node=1.5), "whole number"),
+        (lambda g: g.add_node(node=2**63), "node 9223372036854775808: an id has 64 bits"),
         (lambda g: g.add_edge(0, 7, STEP, np.eye(3)), "node 7 is unknown"),
         (lambda g: g.add_edge(1, 1, STEP, np.eye(3)), "tied to itself"),
         (lambda g: g.add_edge(0, 2, NAN, np.eye(3)), "0 to 2.*not finite"),
@@ -272,6 +324,17 @@ def test_bad_input_is_refused_and_changes_nothing(add, message):
     assert graph.update().scope == "none"
     graph.add_edge(2, graph.add_node(), STEP, np.eye(3))
     assert graph.update().scope == "placed"
+
+
+def test_after_the_largest_id_the_next_one_must_be_given():
+    graph = nodes(3)
+    graph.add_edge(2, graph.add_node(node=2**63 - 1), STEP, np.eye(3))
+    with pytest.raises(InputError, match="give a smaller one"):
+        graph.add_node()
+    assert graph.num_nodes == len(graph.ids) == len(graph.Ts_world_node) == 4
+    graph.add_edge(2, graph.add_node(node=3), STEP, np.eye(3))
+    assert graph.update().scope == "placed"
+    assert solve(graph.graph()).num_components == 1
 
 
 def test_a_node_without_a_place_is_named_and_can_be_mended():

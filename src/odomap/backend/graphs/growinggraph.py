@@ -126,6 +126,8 @@ class GrowingGraph:
         node = self._next_id if node is None else node
         if isinstance(node, bool) or not isinstance(node, int | np.integer):
             raise InputError(f"pose graph: the id of a node is a whole number, not {node!r}")
+        if not -(2**63) <= node < 2**63:
+            raise InputError(f"pose graph: node {node}: an id has 64 bits; give a smaller one")
         if node in self._index:
             raise InputError(f"pose graph: node {node} is there already")
         T = self._unknown(1)[0]

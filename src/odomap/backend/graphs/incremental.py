@@ -13,7 +13,8 @@ of cost c are within a fraction ε of the optimum as long as
                           have left nothing to gain, one factorisation proves it
 
 A loop that brings news breaks the bound at once; one that agrees with the map does not. Where the
-cost rises by more than noise explains, a chordal start is tried beside the present poses.
+cost rises by more than noise explains, or a loss lets go of a new loop, another start is tried
+beside the present poses (`restarts`).
 
 Cost: O(window) per addition, whatever the size of the graph, but for loops that move all of it.
 
@@ -22,6 +23,7 @@ IEEE Transactions on Robotics 24(5), 2008 (windows); compare M. Kaess et al., "i
 2012, which keeps the factor of everything up to date instead.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -32,10 +34,10 @@ from odomap.backend.descent import Descent, SolverConfig, descend
 from odomap.backend.graphs.graphproblem import GraphProblem, GraphState
 from odomap.backend.graphs.growing import GrowingArray
 from odomap.backend.graphs.growinggraph import GrowingGraph
-from odomap.backend.graphs.initialization import chordal
 from odomap.backend.graphs.innovation import least_rise
 from odomap.backend.graphs.neighbourhood import Neighbourhood
 from odomap.backend.graphs.posegraph import Group, PoseGraph
+from odomap.backend.graphs.restarts import is_let_go, or_from_chordal, or_from_confirmed
 from odomap.backend.graphs.solve import Stop
 from odomap.errors import InputError
 from odomap.geometry.robust import Loss
@@ -132,6 +134,7 @@ class IncrementalPoseGraph:
         self._num_redundant = 0
         self._is_between_held = False  # a measurement no window sees
         self._num_solved = 0, 0
+        self._num_doubted = 0  # edges there were when loops were last asked to confirm each other
 
     def add_node(
         self,
@@ -192,8 +195,8 @@ class IncrementalPoseGraph:
         if not self._seeds:
             return self._record("placed" if self._moved else "none", 0, True, "nothing to solve")
         if len(self._seeds) <= self.config.window and not self._is_between_held:
-            self._solve_window()
-            if self._cost <= self._limit:
+            is_held_on = self._solve_window()
+            if is_held_on and self._cost <= self._limit:
                 return self._record("window", 0, True, "within the bound")
         descent = self._solve_whole(stop)
         return self._record("whole", descent.iterations, descent.converged, descent.reason)
@@ -283,8 +286,8 @@ class IncrementalPoseGraph:
         problem.analyse()
         return problem
 
-    def _solve_window(self) -> None:
-        """Solve the nodes around what is new, the rest held."""
+    def _solve_window(self) -> bool:
+        """Solve the nodes around what is new, the rest held; say whether all that is new counts."""
         seeds = list(dict.fromkeys(reversed(self._seeds)))
         graph, near, priors = self._graph.around(seeds, self.config.window)
         self._bound += _RELIED_ON * self._rise(graph, near, priors)
@@ -298,6 +301,7 @@ class IncrementalPoseGraph:
         for rows, which, now in (edges, (self._prior_cost.rows, priors, costs[len(near.edges) :])):
             self._cost += float(now.sum() - rows[which].sum())
             rows[which] = now
+        return not (is_let_go(problem, self.loss) & (near.edges >= self._num_solved[0])).any()
 
     def _rise(self, graph: PoseGraph, near: Neighbourhood, priors: list[int]) -> float:
         """Return by how much what is new around here raises the least cost at least."""
@@ -316,13 +320,10 @@ class IncrementalPoseGraph:
         graph = self._graph.whole()
         problem = self._problem(graph, self._graph.is_held)
         stopped = None if stop is None else stop.is_set
-        descent = descend(problem, _state(problem), self._solver, stopped)
-        expected = self.config.surprise * graph.dim * self._num_redundant
-        if descent.cost_after - self._bound > expected and not (stopped and stopped()):
-            start = problem.state(chordal(graph), graph.points.points_world)
-            other = descend(problem, start, self._solver, stopped)
-            descent = min(descent, other, key=lambda one: one.cost_after)
-        if descent.iterations:
+        descent = present = descend(problem, _state(problem), self._solver, stopped)
+        if not (stopped and stopped()):
+            descent = self._or_from_elsewhere(problem, present, stopped)
+        if descent.iterations or descent is not present:
             self._graph.Ts_world_node[:] = descent.x.Ts[:-1]
             self._moved = list(range(graph.num_nodes))
         costs = self._costs(problem, descent.x)
@@ -333,6 +334,22 @@ class IncrementalPoseGraph:
             self._bound = (1.0 - self._solver.tolerance) * self._cost
             self._num_redundant = 0
         return descent
+
+    def _or_from_elsewhere(
+        self, problem: GraphProblem, present: Descent[GraphState], stop: Callable[[], bool] | None
+    ) -> Descent[GraphState]:
+        """Return what was found, or better poses from another start if news came as a surprise."""
+        graph, loss = problem.graph, self.loss
+        if loss.name != "quadratic":
+            has_news = bool(graph.is_loop[self._num_doubted :].any())
+            self._num_doubted = graph.num_edges
+            if not has_news:
+                return present
+            return or_from_confirmed(problem, loss, present, self._solver, stop)
+        expected = self.config.surprise * graph.dim * self._num_redundant
+        if present.cost_after - self._bound <= expected:
+            return present
+        return or_from_chordal(problem, present, self._solver, stop)
 
     def _costs(self, problem: GraphProblem, x: GraphState) -> Array:
         """Return the cost of each edge, and then of each prior."""
