@@ -26,6 +26,7 @@ from odomap.geometry.lie import (
     sim3_inverse,
     sim3_log,
 )
+from odomap.geometry.robust import Loss
 
 LIE = {
     "SE2": (3, se2_exp, se2_inverse, se2_log),
@@ -235,3 +236,104 @@ def test_what_was_not_measured_is_refused():
     with pytest.raises(InputError, match="a pose is not known"):
         covariances(graph.placed(np.full((12, 3, 3), np.nan)))
     assert covariances(graph, []).shape == (0, 3, 3)
+
+
+def chain(group, sights, points, priors=None, nodes=8):
+    """Return a chain at truth, whose nodes see landmarks: (node, landmark, error) each."""
+    k, exp, inverse, _ = LIE[group]
+    step = np.zeros(k)
+    step[0], step[{3: 2}.get(k, 5)] = 1.0, 0.3
+    Ts = np.array([exp(i * step) for i in range(nodes)])
+    d = Ts.shape[1] - 1
+    first, steps = np.arange(nodes - 1), np.tile(exp(step), (nodes - 1, 1, 1))
+    seen = [
+        (inverse(Ts[i])[:d, :d] @ points[m] + inverse(Ts[i])[:d, d] + error)
+        for i, m, error in sights
+    ]
+    node, point = (np.array([sight[a] for sight in sights], np.int64) for a in (0, 1))
+    landmarks = Sights(
+        points,
+        np.arange(len(points)) + 500,
+        node,
+        point,
+        seen,
+        np.tile(np.eye(d), (len(node), 1, 1)),
+    )
+    information = np.tile(np.eye(k), (nodes - 1, 1, 1))
+    return PoseGraph(
+        group, Ts, first, first + 1, steps, information, points=landmarks, priors=priors
+    )
+
+
+@pytest.mark.parametrize("name", ["tukey", "cauchy"])
+def test_sights_count_as_they_did_in_the_end(name):
+    points = np.array([[2.0, 1.0], [1.0, 3.0]])
+    sights = [(0, 0, 0.0), (0, 1, 0.0), (7, 0, 30.0), (7, 1, 0.0)]
+    solution = solve(chain("SE2", sights, points), loss=Loss(name), initial="given")
+    weights = solution.sight_weights
+    assert weights[2] < 0.02
+    scaled = replace(
+        solution.graph,
+        points=replace(
+            solution.graph.points, information=np.maximum(weights, 1e-12)[:, None, None] * np.eye(2)
+        ),
+    )
+    found = covariances(solution)
+    np.testing.assert_allclose(found, covariances(scaled), rtol=1e-6, atol=1e-12)
+    if name == "tukey":  # one sight of it is left: it says nothing
+        rest = covariances(chain("SE2", [(0, 0, 0.0), (7, 0, 0.0)], points[1:]))
+        np.testing.assert_allclose(found, rest, rtol=1e-6, atol=1e-12)
+
+
+def test_a_landmark_that_nothing_sees_is_left_out():
+    points = np.array([[2.0, 1.0], [1.0, 3.0], [4.0, 4.0]])
+    sights = [(0, 0, 0.0), (7, 0, 0.0), (3, 2, 0.0)]
+    want = covariances(chain("SE2", [(0, 0, 0.0), (7, 0, 0.0)], points[:1]))
+    np.testing.assert_allclose(covariances(solve(chain("SE2", sights, points))), want, rtol=1e-6)
+    graph = chain("SE2", sights, points)
+    graph.points.points_world[1] = np.nan
+    np.testing.assert_allclose(covariances(graph), want, rtol=1e-6)
+    graph.points.points_world[2] = np.nan
+    with pytest.raises(InputError, match="a landmark is not known"):
+        covariances(graph)
+
+
+def priors_of(group, nodes, seen):
+    """Return priors of nodes of `chain`, that tell the directions `seen` only."""
+    k = LIE[group][0]
+    Ts = chain(group, [], np.zeros((0, 2 if k == 3 else 3))).Ts_world_node[nodes]
+    return Priors(nodes, Ts, np.tile(np.diag(seen).astype(float), (len(nodes), 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("group", "nodes", "seen", "free"),
+    [
+        ("SE2", [3], [0, 0, 0], 3),
+        ("SE2", [3], [1, 1, 0], 1),
+        ("SE2", [3, 3], [1, 1, 0], 1),
+        ("SE2", [2, 5], [0, 0, 1], 2),
+        ("SE3", [2], [1, 1, 1, 0, 0, 0], 3),
+        ("SE3", [2, 5], [1, 1, 1, 0, 0, 0], 1),
+        ("Sim3", [2, 5], [1, 1, 1, 0, 0, 0, 0], 1),
+        ("Sim3", [2], [1, 1, 1, 1, 1, 1, 0], 1),
+    ],
+)
+def test_a_part_whose_priors_do_not_hold_it_is_named(group, nodes, seen, free):
+    none = np.zeros((0, 2 if group == "SE2" else 3))
+    graph = chain(group, [], none, priors_of(group, nodes, seen))
+    message = rf"part of node 0 \(8 nodes\).*leave {free} of .* fix a node or give a prior"
+    with pytest.raises(InputError, match=message) as caught:
+        covariances(graph)
+    assert "\n" not in str(caught.value)
+    fixed = replace(graph, is_fixed=np.arange(8) == 4)
+    assert np.isfinite(covariances(fixed)).all()
+
+
+def test_priors_that_hold_a_part_together():
+    none = np.zeros((0, 3))
+    for group, nodes in (("SE3", [0, 4, 7]), ("Sim3", [0, 4, 7])):
+        seen = [1, 1, 1] + [0] * (LIE[group][0] - 3)
+        found = covariances(chain(group, [], none, priors_of(group, nodes, seen)))
+        assert np.linalg.eigvalsh(found).min() > 0.0
+    graph = chain("SE2", [], np.zeros((0, 2)), priors_of("SE2", [2, 3], [1, 1, 0]))
+    assert np.linalg.eigvalsh(covariances(graph)).min() > 0.0

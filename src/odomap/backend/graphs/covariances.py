@@ -10,38 +10,40 @@ nodes, the motion D = T_i⁻¹ T_j between them varies in its own tangent by
 which no longer depends on where the graph is held. A marginal covariance does: it is relative to
 the nodes that are held, a fixed node or the anchor of each connected part, and these have none.
 
-Edges count as they did in the end: by their information, times the weight a robust solution gave.
+Edges and sights count as they did in the end: by their information, times the weight a robust
+solution gave. Landmarks that nothing sees in the end are left out; they say nothing of the poses.
 Cost: one factorisation, O(N^1.5) for maps, and less for a selected inverse of the factor's pattern.
 
 Reference: M. Kaess, F. Dellaert, "Covariance recovery from a square root information matrix for
 data association", Robotics and Autonomous Systems 57(12), 2009.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.backend.descent import Linear
 from odomap.backend.graphs.components import Components, find_components
+from odomap.backend.graphs.consensus import LIE
 from odomap.backend.graphs.graphproblem import GraphProblem
-from odomap.backend.graphs.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph, Sights
 from odomap.backend.graphs.solve import Solution
 from odomap.backend.sparse import marginals
 from odomap.backend.sparse.blockcholesky import BlockCholesky
 from odomap.errors import InputError
-from odomap.geometry.lie import (
-    se2_adjoint,
-    se2_inverse,
-    se3_adjoint,
-    se3_inverse,
-    sim3_adjoint,
-    sim3_inverse,
-)
 from odomap.geometry.robust import Loss
 
 __all__ = ["GraphCovariances", "covariances", "joint_covariance", "relative_covariance"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_TRACE = 1e-16
+"""Share of its largest below which information of a direction of a part's place is rounding."""
+
+_TIED = 1e-9
+"""Least eigenvalue of a part's information, its diagonal scaled to 1, that is not."""
 
 
 def covariances(solution: Solution | PoseGraph, nodes: ArrayLike | None = None) -> Array:
@@ -91,7 +93,7 @@ class GraphCovariances:
     """
 
     def __init__(self, solution: Solution | PoseGraph) -> None:
-        graph, weights = _parts(solution)
+        graph, weights = _counting(solution)
         for values, name in (
             (graph.Ts_world_node, "pose"),
             (graph.points.points_world, "landmark"),
@@ -99,7 +101,8 @@ class GraphCovariances:
             if not np.isfinite(values).all():
                 raise InputError(f"covariances: a {name} is not known; solve the graph first")
         self.graph = graph
-        self._components = find_components(graph, weights, through_landmarks=True)
+        self._components = find_components(graph, through_landmarks=True)
+        _refuse_loose(graph, self._components)
         held = np.array(graph.is_fixed)
         held[self._components.anchor[self._components.is_free]] = True
         self._column, self._factor = _factor(graph, weights, held)
@@ -134,13 +137,8 @@ class GraphCovariances:
         """Return the (k, k) covariance of T_i⁻¹ T_j in its tangent."""
         a, b = (int(node) for node in self._indices([i, j]))
         self._refuse_apart(a, b)
-        adjoint, inverse = {
-            "SE2": (se2_adjoint, se2_inverse),
-            "SE3": (se3_adjoint, se3_inverse),
-            "Sim3": (sim3_adjoint, sim3_inverse),
-        }[self.graph.group]
-        Ts = self.graph.Ts_world_node
-        M = adjoint(inverse(Ts[b]) @ Ts[a])
+        lie, Ts = LIE[self.graph.group], self.graph.Ts_world_node
+        M = lie.adjoint(lie.inverse(Ts[b]) @ Ts[a])
         J = np.hstack([-M, np.eye(self.graph.dim)])
         return np.asarray(J @ self.joint(a, b) @ J.T)
 
@@ -170,11 +168,58 @@ class GraphCovariances:
         return array.astype(np.int64)
 
 
-def _parts(solution: Solution | PoseGraph) -> tuple[PoseGraph, Array]:
-    """Return the graph, and by how much each edge counts."""
-    if isinstance(solution, Solution):
-        return solution.graph, solution.weights
-    return solution, np.ones(solution.num_edges)
+def _counting(solution: Solution | PoseGraph) -> tuple[PoseGraph, Array]:
+    """Return the graph of what counted in the end, and weights of its edges."""
+    if not isinstance(solution, Solution):
+        every = np.ones(len(solution.points.node))
+        return _with_sights(solution, every), np.ones(solution.num_edges)
+    weights = solution.weights
+    graph = solution.graph.without(weights <= 0.0)
+    return _with_sights(graph, solution.sight_weights), weights[weights > 0.0]
+
+
+def _with_sights(graph: PoseGraph, weights: Array) -> PoseGraph:
+    """Return a graph whose sights count by weights (S,), without landmarks that none is left of."""
+    points, keep = graph.points, weights > 0.0
+    if not len(points.points_world):
+        return graph
+    seen, point = np.unique(points.point[keep], return_inverse=True)
+    sights = Sights(
+        points.points_world[seen],
+        points.ids[seen],
+        points.node[keep],
+        point,
+        points.points_node[keep],
+        points.information[keep] * weights[keep, None, None],
+    )
+    return replace(graph, points=sights)
+
+
+def _refuse_loose(graph: PoseGraph, components: Components) -> None:
+    """Refuse parts whose priors do not hold them.
+
+    All poses of a part may move together, by ξ at its anchor a: then a node p moves by
+    Ad(T_p⁻¹ T_a) ξ, of which the priors must see every direction between them.
+    """
+    node, k = graph.priors.node, graph.dim
+    part = components.label[node]
+    lie, Ts = LIE[graph.group], graph.Ts_world_node
+    J = lie.adjoint(lie.inverse(Ts[node]) @ Ts[components.anchor[part]])
+    held = np.zeros((components.count, k, k))
+    np.add.at(held, part, np.swapaxes(J, 1, 2) @ graph.priors.information @ J)
+    diagonal = np.diagonal(held, axis1=1, axis2=2)
+    size = np.sqrt(np.maximum(diagonal, _TRACE * diagonal.max(axis=1, initial=0.0)[:, None]))
+    size = np.where(size > 0.0, size, 1.0)
+    known = np.linalg.eigvalsh(held / (size[:, :, None] * size[:, None, :])) > _TIED
+    loose = components.has_prior & ~components.has_fixed & ~known.all(axis=1)
+    if loose.any():
+        which = int(np.argmax(loose))
+        nodes = np.flatnonzero(components.label == which)
+        raise InputError(
+            f"covariances: the part of node {graph.ids[nodes[0]]} ({len(nodes)} nodes) is not "
+            f"determined: its priors leave {int((~known[which]).sum())} of {k} directions free; "
+            "fix a node or give a prior with full information"
+        )
 
 
 def _factor(
