@@ -11,6 +11,7 @@ from loopworlds import passed_again
 from odomap.backend.graphs.consensus import (
     LEAST_VARIANCE,
     LIE,
+    _nearest,
     chi2_quantile,
     covariance_of,
     find_consensus,
@@ -122,3 +123,20 @@ def test_edges_without_weight_confirm_nothing():
     chain, _ = world("SE2", loops=0)
     assert find_consensus(chain).variance == 1.0
     assert not find_consensus(chain).is_confirmed.any()
+
+
+@pytest.mark.parametrize("spread", [1, 4, 60])
+def test_partners_are_the_nearest_also_of_many_loops_at_one_node(spread):
+    rng = np.random.default_rng(spread)
+    begin, end = rng.integers(0, spread, 120), rng.integers(0, 60, 120)
+    order = np.lexsort((end, begin))
+    begin, end = begin[order], end[order]
+    near = np.full((120, 8), -1)
+    _nearest(begin, end, 30, near)
+    far = np.abs(begin[:, None] - begin) + np.abs(end[:, None] - end)
+    np.fill_diagonal(far, 1000)
+    for i in range(120):
+        partners = near[i][near[i] >= 0]
+        assert len(set(partners.tolist())) == len(partners)
+        want = np.sort(far[i])[:8]
+        np.testing.assert_array_equal(far[i, partners], want[want < 30])

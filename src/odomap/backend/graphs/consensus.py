@@ -262,7 +262,7 @@ def _corrections(graph: PoseGraph, chain: _Chain, loops: Index) -> _Corrections:
 def _pairs(graph: PoseGraph, chain: _Chain, loop: _Corrections) -> _Tests:
     """Compare each loop edge with those nearest to it."""
     begin, end = chain.position[loop.begin], chain.position[loop.end]
-    order = np.argsort(begin, kind="stable")
+    order = np.lexsort((end, begin))
     near = np.full((len(begin), _PARTNERS), -1, np.int64)
     _nearest(begin[order], end[order], 2 * graph.num_nodes, near)
     one, rank = np.nonzero(near >= 0)
@@ -339,23 +339,46 @@ def _variance_factor(graph: PoseGraph, tests: _Tests, quantile: float) -> float:
 
 
 @kernel
+def _insert(distance: Index, near: Index, far: int, j: int) -> None:
+    """Put j among the nearest, the last of which falls out."""
+    m = len(distance) - 1
+    while m > 0 and distance[m - 1] > far:
+        distance[m], near[m] = distance[m - 1], near[m - 1]
+        m -= 1
+    distance[m], near[m] = far, j
+
+
+@kernel
 def _nearest(begin: Index, end: Index, reach: int, near: Index) -> None:
-    """near (L, M) = others by |a - c| + |b - d|, nearest first; begin ascends."""
+    """near (L, M) = others by |a - c| + |b - d|, nearest first; begin ascends, then end.
+
+    Those that begin at one node are looked at from the end alike outwards, and no further than what
+    is found already: many loops at one node cost no more than many at many.
+    """
     count, partners = near.shape
-    distance = np.empty(partners, np.int64)
+    distance, first, last = np.empty(partners, np.int64), np.empty_like(begin), np.empty_like(begin)
+    for i in range(count):
+        first[i] = first[i - 1] if i > 0 and begin[i - 1] == begin[i] else i
+    for i in range(count - 1, -1, -1):
+        last[i] = last[i + 1] if i + 1 < count and begin[i + 1] == begin[i] else i
     for i in range(count):
         distance[:] = reach
         for way in (-1, 1):
-            j = i + way
-            while 0 <= j < count and abs(begin[j] - begin[i]) < distance[partners - 1]:
-                far = abs(begin[j] - begin[i]) + abs(end[j] - end[i])
-                if far < distance[partners - 1]:
-                    m = partners - 1
-                    while m > 0 and distance[m - 1] > far:
-                        distance[m], near[i, m] = distance[m - 1], near[i, m - 1]
-                        m -= 1
-                    distance[m], near[i, m] = far, j
-                j += way
+            at = i if way < 0 else last[i] + 1
+            while 0 <= at < count and abs(begin[at] - begin[i]) < distance[partners - 1]:
+                apart = abs(begin[at] - begin[i])
+                above = first[at] + np.searchsorted(end[first[at] : last[at] + 1], end[i])
+                j = above - 1
+                while j >= first[at] and apart + end[i] - end[j] < distance[partners - 1]:
+                    if j != i:
+                        _insert(distance, near[i], apart + end[i] - end[j], j)
+                    j -= 1
+                j = above
+                while j <= last[at] and apart + end[j] - end[i] < distance[partners - 1]:
+                    if j != i:
+                        _insert(distance, near[i], apart + end[j] - end[i], j)
+                    j += 1
+                at = first[at] - 1 if way < 0 else last[at] + 1
 
 
 def warm_up() -> None:

@@ -4,7 +4,7 @@ Choosing edges means solving the graph again and again, each time with other wei
 the right poses. Edges of weight 0 are taken out before the equations are laid out: a false loop
 ties far parts of the graph together and may cost more to eliminate than all true ones. The start is
 the better of where the poses were and of the relaxation (`initialization`), which no false loop
-that has lost its weight can hold in a wrong valley.
+that has lost its weight can hold in a wrong valley; it is tried again when many have.
 
 How sure the graph is of the error e = log(Z⁻¹ D) of any edge is the covariance P of its change
 J (δ_j - M δ_i), M = Ad(D⁻¹), J = J_r⁻¹(e). Neighbours in the factor have it from one selected
@@ -28,7 +28,8 @@ from odomap.backend.graphs.graphproblem import GraphProblem, GraphState
 from odomap.backend.graphs.initialization import chordal, place_landmarks
 from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.backend.sparse.blockcholesky import BlockCholesky
-from odomap.backend.sparse.marginals import Marginals, joint_covariance
+from odomap.backend.sparse.crossblocks import cross_blocks
+from odomap.backend.sparse.marginals import Marginals
 from odomap.geometry.robust import Loss
 
 __all__ = ["Subgraph", "SubgraphSolution"]
@@ -67,19 +68,34 @@ class Subgraph:
     def __init__(self, graph: PoseGraph, stop: Callable[[], bool] | None = None) -> None:
         self.graph, self.stop = graph, stop
         self._whole = _problem(graph, np.ones(graph.num_edges), find_components(graph))
+        self._num_relaxed = 0
+        self._sure: tuple[SubgraphSolution, BlockCholesky, Marginals] | None = None
 
     def solve(
-        self, weights: Array, before: SubgraphSolution | None, config: SolverConfig
+        self,
+        weights: Array,
+        before: SubgraphSolution | None,
+        config: SolverConfig,
+        is_near: bool = False,
     ) -> SubgraphSolution:
-        """Solve with weights (E,), from the better of the last solution and the relaxation."""
+        """Solve with weights (E,), from the better of the last solution and the relaxation.
+
+        Args:
+            weights: (E,) by which edges count, those of 0 left out.
+            before: last solution, if there is one.
+            config: of the descent.
+            is_near: whether little has changed since: while fewer than a tenth of the edges have
+                gone since the last relaxation, it need not be tried again.
+        """
         used = self.graph.without(weights <= 0.0)
         w = weights[weights > 0.0]
         components = find_components(used, through_landmarks=True)
         problem = _problem(used, w, components)
         problem.analyse()
-        starts = [problem.state(*_placed(used, chordal(used, None, w)))]
-        if before is not None:
-            starts.insert(0, before.x)
+        starts = [] if before is None else [before.x]
+        if not (starts and is_near and used.num_edges > 0.9 * self._num_relaxed):
+            starts.append(problem.state(*_placed(used, chordal(used, None, w))))
+            self._num_relaxed = used.num_edges
         start = min(starts, key=problem.cost_of_edges)
         descent = descend(problem, start, config, self.stop)
         equations = used.dim * (used.num_edges + len(used.priors.node))
@@ -100,25 +116,17 @@ class Subgraph:
 
     def covariances(self, solution: SubgraphSolution, edges: Index) -> Array:
         """Return P (n, k, k) of the errors of edges that count in the solution."""
-        marginals = Marginals(_factored(solution))
-        return self._relative(solution, edges, marginals, of_neighbours=True)
+        _, marginals = self._certainty(solution)
+        return self._relative(solution, edges, marginals.pairs)
 
     def bounds(self, solution: SubgraphSolution, edges: Index) -> Array:
         """Return upper bounds (n, k, k) of P, of any edges."""
-        marginals = Marginals(_factored(solution))
-        return 2.0 * self._relative(solution, edges, marginals, of_neighbours=False)
+        return 2.0 * self._relative(solution, edges, None)
 
     def joint(self, solution: SubgraphSolution, edges: Index) -> Array:
-        """Return P (n, k, k) of any edges, one after the other."""
-        factor, k = _factored(solution), self.graph.dim
-        M, J = self._derivatives(solution, edges)
-        out = np.zeros((len(edges), k, k))
-        for n, e in enumerate(edges):
-            columns = solution.problem.column[[self.graph.first[e], self.graph.second[e]]]
-            free = columns >= 0
-            both = J[n] @ np.hstack([-M[n], np.eye(k)])[:, np.repeat(free, k)]
-            out[n] = both @ joint_covariance(factor, columns[free]) @ both.T
-        return out
+        """Return P (n, k, k) of any edges."""
+        factor, _ = self._certainty(solution)
+        return self._relative(solution, edges, lambda i, j: cross_blocks(factor, i, j))
 
     def is_apart(self, solution: SubgraphSolution, edges: Index) -> NDArray[np.bool_]:
         """Return which edges (n,) would tie parts that nothing ties to each other."""
@@ -136,27 +144,36 @@ class Subgraph:
         M = lie.adjoint(lie.inverse(self._motions(solution, edges)))
         return M, lie.right_jacobian_inverse(self.errors(solution, edges))
 
+    def _certainty(self, solution: SubgraphSolution) -> tuple[BlockCholesky, Marginals]:
+        """Return the factor of H at a solution and its marginals, found once for each solution."""
+        if self._sure is None or self._sure[0] is not solution:
+            factor = _factored(solution)
+            self._sure = solution, factor, Marginals(factor)
+        return self._sure[1:]
+
     def _relative(
-        self, solution: SubgraphSolution, edges: Index, marginals: Marginals, of_neighbours: bool
+        self,
+        solution: SubgraphSolution,
+        edges: Index,
+        shared: Callable[[Index, Index], Array] | None,
     ) -> Array:
-        """Return J (M P_i Mᵀ + P_j) Jᵀ of edges, and of neighbours less what both share."""
-        k = self.graph.dim
+        """Return J (M P_i Mᵀ + P_j) Jᵀ of edges, less what both ends share where that is asked."""
+        k, (_, marginals) = self.graph.dim, self._certainty(solution)
         i = solution.problem.column[self.graph.first[edges]]
         j = solution.problem.column[self.graph.second[edges]]
 
-        def block(a: Index, b: Index) -> Array:
+        def block(a: Index, b: Index, between: Callable[[Index, Index], Array]) -> Array:
             free = (a >= 0) & (b >= 0)
             found = np.zeros((len(a), k, k))
             if free.any():
-                found[free] = marginals.pairs(a[free], b[free])
+                found[free] = between(a[free], b[free])
             return found
 
         M, J = self._derivatives(solution, edges)
-        M_T = np.swapaxes(M, 1, 2)
-        P = M @ block(i, i) @ M_T + block(j, j)
-        if of_neighbours:
-            shared = M @ block(i, j)
-            P -= shared + np.swapaxes(shared, 1, 2)
+        P = M @ block(i, i, marginals.pairs) @ np.swapaxes(M, 1, 2) + block(j, j, marginals.pairs)
+        if shared is not None:
+            both = M @ block(i, j, shared)
+            P -= both + np.swapaxes(both, 1, 2)
         return np.asarray(J @ P @ np.swapaxes(J, 1, 2))
 
 
