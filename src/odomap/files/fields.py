@@ -23,6 +23,9 @@ __all__ = ["Fields", "read_yaml"]
 ROTATION_TOLERANCE = 1e-3
 """How far a written rotation may be from orthonormal: three to four printed digits."""
 
+EXACT = 1e-14
+"""A rotation that is one up to rounding is taken as it stands."""
+
 
 class _Loader(yaml.SafeLoader):
     """Safe YAML that also reads OpenCV's matrices, as mappings."""
@@ -191,6 +194,8 @@ class Fields:
             raise self.error(name, "must end with the row 0, 0, 0, 1")
         if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
             raise self.error(name, "is not a rigid transform: its 3x3 block is no rotation")
+        if error < EXACT:
+            return SE3.from_parts(rotation, matrix[:3, 3])  # what was written is read back exactly
         u, _, vt = np.linalg.svd(rotation)
         return SE3.from_parts(u @ vt, matrix[:3, 3])
 

@@ -32,7 +32,7 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import CameraMount, DepthMount, ImuMount, LidarMount, Rig
 
-__all__ = ["VERSION", "located", "read_rig", "write_rig"]
+__all__ = ["VERSION", "located", "read_rig", "rig_fields", "rig_of", "write_rig"]
 
 VERSION = 1
 
@@ -50,7 +50,16 @@ def read_rig(path: str | Path) -> Rig:
     file = Path(path)
     if file.is_dir():
         file = file / "rig.yaml"
-    fields = read_yaml(file)
+    return rig_of(read_yaml(file))
+
+
+def rig_of(fields: Fields) -> Rig:
+    """Return the rig that the fields of a rig.yaml describe.
+
+    Raises:
+        CalibrationError: a field is missing, mistyped, of a wrong kind, or implausible.
+    """
+    file = fields.where
     version = fields.number("odomap_rig")
     if version != VERSION:
         raise CalibrationError(
@@ -154,6 +163,12 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     Raises:
         OutputError: it cannot be written.
     """
+    text = yaml.safe_dump(rig_fields(rig), sort_keys=False, default_flow_style=None, width=1000)
+    write_text(path, text)
+
+
+def rig_fields(rig: Rig) -> dict[str, Any]:
+    """Return the fields of a rig.yaml, plain numbers and texts; `rig_of` reads them."""
     content: dict[str, Any] = {"odomap_rig": VERSION}
     if rig.body:
         content["body"] = rig.body
@@ -172,7 +187,7 @@ def write_rig(path: str | Path, rig: Rig) -> None:
         content["imu"]["T_body_imu"] = rig.imu.T_body_imu.matrix.tolist()
     if rig.lidars:
         content["lidars"] = [_lidar_fields(mount) for mount in rig.lidars]
-    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=1000))
+    return content
 
 
 def _camera_fields(mount: CameraMount) -> dict[str, Any]:

@@ -73,6 +73,14 @@ class Edges:
         self._kind.append(kind)
         return row
 
+    def restore(self, table: EdgeTable) -> None:
+        """Fill an empty table with the edges of another."""
+        self._ends = np.column_stack([table.i, table.j]).astype(np.int64)
+        self._Ts = table.Ts_i_j.copy()
+        self._scales = table.scales_i_j.copy()
+        self._information = table.information.copy()
+        self._kind = list(table.kind)
+
     def table(self) -> EdgeTable:
         """Return all edges, copied."""
         rows = len(self._kind)

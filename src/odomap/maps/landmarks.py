@@ -9,6 +9,9 @@ Looking up N ids is O(N). The table is compacted when it would grow: paths are s
 at its beginning are cut off, so that odometry, which forgets what it passed, needs constant memory.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +50,54 @@ class Landmarks:
 
     def __len__(self) -> int:
         return self._end - len(self._free)
+
+    @property
+    def next_id(self) -> int:
+        """The id that the next landmark will have."""
+        return self._next
+
+    def dump(self) -> dict[str, NDArray[Any]]:
+        """Return copies of all that decides how the table goes on.
+
+        Returns:
+            By name: slot, id, anchor, p_anchor, descriptor, seen of the (M,) landmarks in order of
+            their slots; free, the (S,) slots to be used again, the last first; fused and survivor,
+            the (F,) ids that mean another landmark, and its id.
+        """
+        slots = self.all_slots()
+        fused = self._first + np.flatnonzero(self._entry[: self._next - self._first] <= -2)
+        heirs = self.slots(fused)
+        return {
+            "slot": slots,
+            "id": self.ids[slots],
+            "anchor": self.anchor[slots],
+            "p_anchor": self.p_anchor[slots],
+            "descriptor": self.descriptor[slots],
+            "seen": self.seen[slots],
+            "free": np.asarray(self._free, np.int64),
+            "fused": fused[heirs >= 0],
+            "survivor": self.ids[heirs[heirs >= 0]],
+        }
+
+    def restore(self, columns: Mapping[str, NDArray[Any]], next_id: int) -> None:
+        """Fill an empty table with what `dump` returned; O(ids since the oldest one alive)."""
+        slots, ids = columns["slot"], columns["id"]
+        self._free = columns["free"].tolist()
+        self._end = len(slots) + len(self._free)
+        self.ids = grown(self.ids, self._end, fill=_DEAD)
+        self.anchor = grown(self.anchor, self._end)
+        self.p_anchor = grown(self.p_anchor, self._end)
+        self.descriptor = grown(self.descriptor, self._end)
+        self.seen = grown(self.seen, self._end)
+        self.ids[slots], self.anchor[slots] = ids, columns["anchor"]
+        self.p_anchor[slots], self.seen[slots] = columns["p_anchor"], columns["seen"]
+        self.descriptor[slots] = columns["descriptor"]
+        self._by_anchor.append(columns["anchor"].astype(np.int64), slots.astype(np.int32))
+        oldest = (int(known.min(initial=next_id)) for known in (ids, columns["fused"]))
+        self._first, self._next = min(oldest), next_id
+        self._entry = np.full(next_id - self._first, _DEAD, np.int64)
+        self._entry[ids - self._first] = slots
+        self._entry[columns["fused"] - self._first] = -2 - columns["survivor"]
 
     def slots(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the (N,) slots of (N,) ids; a fused id gives its survivor's, a dead one -1."""

@@ -14,6 +14,8 @@ Reference: R. Mur-Artal, J. Montiel, J. Tardós, ORB-SLAM: a versatile and accur
 system, 2015.
 """
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,6 +24,7 @@ from odomap.maps.columns import distinct, members
 from odomap.maps.sightings import Sightings
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
+from odomap.maps.tables import MapTables
 from odomap.maps.tree import ALIVE
 
 __all__ = ["Map"]
@@ -33,6 +36,49 @@ class Map(Sightings):
     Keyframes and their poses come from `Skeleton`, landmarks and observations from `Sightings`;
     here are the operations on all of them: forgetting and solving.
     """
+
+    def dump(self) -> MapTables:
+        """Return all that is remembered, as arrays: what `restored` makes a map of again.
+
+        The lock is held for as long as it takes to copy the map.
+        """
+        with self.lock:
+            rows = len(self.states)
+            tables = {
+                "states": self.states.dump(),
+                "tree": self._tree.dump(rows),
+                "landmarks": self._landmarks.dump(),
+                "observations": self._observations.dump(rows),
+            }
+            return MapTables(
+                columns={f"{t}/{c}": a for t, table in tables.items() for c, a in table.items()},
+                keyframes=tuple(self._keyframes[k] for k in sorted(self._keyframes)),
+                edges=self._edges.table(),
+                version=self.version,
+                epoch=self.epoch,
+                newest=self._newest,
+                next_keyframe=self._next_keyframe,
+                next_landmark=self._landmarks.next_id,
+            )
+
+    @classmethod
+    def restored(cls, tables: MapTables) -> Self:
+        """Return a map that goes on exactly as the one that was dumped would have.
+
+        Args:
+            tables: from `dump`; that they fit together is up to the caller (`files.mapfile`
+                makes sure of it).
+        """
+        m = cls()
+        m.states.restore(tables.of("states"))
+        m._tree.restore(tables.of("tree"))
+        m._landmarks.restore(tables.of("landmarks"), tables.next_landmark)
+        m._observations.restore(tables.of("observations"))
+        m._edges.restore(tables.edges)
+        m._keyframes = {keyframe.id: keyframe for keyframe in tables.keyframes}
+        m._newest, m._next_keyframe = tables.newest, tables.next_keyframe
+        m.version, m.epoch = tables.version, tables.epoch
+        return m
 
     def cull_keyframes(self, keyframe_ids: ArrayLike) -> None:
         """Remove keyframes that add nothing, and keep placed what hangs from them.

@@ -15,6 +15,9 @@ Landmarks are named by slot here (`Landmarks.slots`); `Map` speaks in ids.
 Reference: H. Strasdat et al., Double window optimisation for constant time visual SLAM, 2011.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +43,37 @@ class Observations:
 
     def __len__(self) -> int:
         return self._end - len(self._free)
+
+    def dump(self, keyframes: int) -> dict[str, NDArray[Any]]:
+        """Return copies of all rows, in the order in which each keyframe has its own.
+
+        Args:
+            keyframes: how many keyframe ids there are.
+
+        Returns:
+            By name: keyframe (ascending), landmark (slots) and keypoint of the (R,) rows, and
+            by_landmark, the rows in the order in which each landmark has its own, by slot.
+        """
+        _, rows = self._by_keyframe.gather(np.arange(keyframes))
+        landmarks = self._landmark[rows]
+        _, others = self._by_landmark.gather(np.arange(int(landmarks.max(initial=-1)) + 1))
+        place = np.zeros(self._end, np.int32)
+        place[rows] = np.arange(len(rows), dtype=np.int32)
+        return {
+            "keyframe": self._keyframe[rows],
+            "landmark": landmarks,
+            "keypoint": self._keypoint[rows],
+            "by_landmark": place[others],
+        }
+
+    def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Fill an empty table with what `dump` returned."""
+        self._keyframe, self._landmark = columns["keyframe"].copy(), columns["landmark"].copy()
+        self._keypoint, self._end = columns["keypoint"].copy(), len(columns["keypoint"])
+        self._alive = np.ones(self._end, np.bool_)
+        rows, others = np.arange(self._end, dtype=np.int32), columns["by_landmark"]
+        self._by_keyframe.append(self._keyframe.astype(np.int64), rows)
+        self._by_landmark.append(self._landmark[others].astype(np.int64), others)
 
     def columns(
         self, rows: NDArray[np.int64] | NDArray[np.int32]

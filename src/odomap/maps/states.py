@@ -12,12 +12,17 @@ Composition, inverse and action are batched NumPy, O(1) per pose.
 Reference: H. Strasdat, J. Montiel, A. Davison, Scale drift-aware large scale monocular SLAM, 2010.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
 
 __all__ = ["States", "act", "act_inverse", "compose", "inverse"]
+
+_COLUMNS = ("Ts_world_body", "scales", "v_world_body", "biases", "covariances")
 
 Placement = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -113,6 +118,16 @@ class States:
     def covariances(self) -> NDArray[np.float64]:
         """(K, 6, 6) covariances, a view that may be written."""
         return self._covariances[: self._rows]
+
+    def dump(self) -> dict[str, NDArray[Any]]:
+        """Return copies of all columns."""
+        return {name: getattr(self, name).copy() for name in _COLUMNS}
+
+    def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Fill an empty table with what `dump` returned."""
+        self.extend(len(columns["scales"]))
+        for name in _COLUMNS:
+            getattr(self, name)[:] = columns[name]
 
     def placements(self, rows: NDArray[np.int64]) -> Placement:
         """Return copies of the (n, 4, 4) poses and (n,) scales of some rows."""

@@ -11,6 +11,9 @@ Reference: R. Mur-Artal, J. Montiel, J. Tardós, ORB-SLAM: a versatile and accur
 system, 2015 (spanning tree, keyframe culling).
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +52,24 @@ class Tree:
         self.status[keyframe] = ALIVE
         self.parent[keyframe] = parent
         self.created[keyframe] = version
+
+    def dump(self, rows: int) -> dict[str, NDArray[Any]]:
+        """Return copies of all columns, of so many keyframes."""
+        return {
+            "status": self.status[:rows].copy(),
+            "parent": self.parent[:rows].copy(),
+            "created": self.created[:rows].copy(),
+            "Ts_parent_self": self._Ts_parent_self[:rows].copy(),
+            "scales_parent_self": self._scales_parent_self[:rows].copy(),
+        }
+
+    def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Fill an empty tree with what `dump` returned."""
+        self.status = columns["status"].copy()
+        self.parent = columns["parent"].copy()
+        self.created = columns["created"].copy()
+        self._Ts_parent_self = columns["Ts_parent_self"].copy()
+        self._scales_parent_self = columns["scales_parent_self"].copy()
 
     def status_of(self, keyframe: int) -> int:
         """Return ABSENT, ALIVE or STUB; ids never given are absent."""
