@@ -20,6 +20,8 @@ THREADS = {"threading", "queue", "multiprocessing", "_thread", "asyncio"}
 MAY_IMPORT_THREADS = {
     "system/worker.py": "Ctrl-C as an event",
     "system/background.py": "runs the stages beside the tracker",
+    "system/feed.py": "reads a source that does not wait",
+    "system/live.py": "tells observers that may be slow",
     "maps/skeleton.py": "the lock of the map",
     "run.py": "Ctrl-C as an event",
 }

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -126,6 +127,53 @@ def test_interrupt_ends_after_the_frame_at_hand_and_writes(world, tmp_path):
     assert (tmp_path / "report.html").exists()
 
 
+@pytest.mark.parametrize("rhythm", ["inline", "lockstep", "live"])
+def test_interrupt_leaves_what_there_is_in_every_rhythm(world, tmp_path, rhythm):
+    before = set(threading.enumerate())
+    with pytest.raises(Interrupted) as stop:
+        run(Stopping(world, after=5), tmp_path, rhythm=rhythm)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["interrupted"] is True
+    assert metrics["rhythm"] == rhythm
+    assert len(read_tum(tmp_path / "trajectory.tum")) == metrics["tracked"] <= 6
+    assert len(stop.value.result.estimates) == metrics["frames"]
+    assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("odomap")]
+
+
+def test_lockstep_is_the_default_and_writes_the_bytes_of_inline(result, tmp_path):
+    assert result.metrics["rhythm"] == "lockstep"
+    assert "\nrhythm: lockstep\n" in (result.out / "config.yaml").read_text()
+    inline = run(WORLD, tmp_path, rhythm="inline")
+    assert inline.metrics["rhythm"] == "inline"
+    for name in ("trajectory.tum", "trajectory_live.tum", "keyframes.tum"):
+        assert (inline.out / name).read_bytes() == (result.out / name).read_bytes()
+    for name in ("frames_dropped", "jobs_skipped", "messages_dropped"):
+        assert inline.metrics[name] == result.metrics[name] == 0
+
+
+def test_live_counts_the_frames_that_it_drops(world, tmp_path):
+    kept = list(world)
+
+    class Kept(Stopping):
+        def __iter__(self):
+            return iter(kept)
+
+    def slow(progress):
+        if progress.stage == "tracking" and progress.done == 2:
+            time.sleep(1.0)  # twenty frames of the sensor
+
+    found = run(Kept(world, -1), tmp_path, rhythm="live", progress=slow)
+    m = json.loads((tmp_path / "metrics.json").read_text())
+    assert m["rhythm"] == "live"
+    assert m["frames_dropped"] >= 5
+    assert m["frames"] + m["frames_dropped"] == 12
+    dropped = m["frames_dropped"]
+    assert (
+        f"{dropped} of 12 frames were dropped: tracking is slower than they come" in found.warnings
+    )
+    assert found.warnings == tuple(m["warnings"])
+
+
 def test_runs_in_a_thread_without_touching_signals(world):
     found = []
     thread = threading.Thread(target=lambda: found.append(run(world, max_frames=2)))
@@ -178,7 +226,7 @@ def test_config_changes_the_run(world, tmp_path):
 
 
 def test_refusals(world, tmp_path):
-    with pytest.raises(ConfigError, match="'locked' is unknown.*use one of: inline, lockstep"):
+    with pytest.raises(ConfigError, match=r"'locked' is unknown.*: inline, lockstep, live"):
         run(world, rhythm="locked")
     with pytest.raises(ConfigError, match="did you mean 'stereo'"):
         run(world, preset="streo")

@@ -34,6 +34,8 @@ REPORTED = (
     "tracked",
     "lost",
     "skipped",
+    "rhythm",
+    "frames_dropped",
     "ms_per_frame",
     "real_time_factor",
     "duration_s",

@@ -8,13 +8,14 @@ appended to ``trajectory_live.tum.part``, so that even a power cut leaves the pa
 end every output is written atomically, the path first, and what cannot be written does not keep
 the others from being. Ctrl-C ends tracking after the frame at hand, writes everything, and is then
 raised again as `Interrupted` with the result inside. The same recording gives the same
-trajectory.tum, byte for byte: nothing on the way to it reads a clock.
+trajectory.tum, byte for byte, unless it is played live: nothing on the way to it reads a clock.
 """
 
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -33,8 +34,13 @@ if TYPE_CHECKING:
     from odomap.sources.source import Source
     from odomap.system.config import Config
     from odomap.system.odometry import Odometry, Result
+    from odomap.system.worker import Worker
 
 __all__ = ["Interrupted", "Progress", "RunResult", "chosen_config", "run"]
+
+
+RHYTHM = "lockstep"
+"""How stages follow each other where nobody says."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ def run(
     preset: str | None = None,
     config: "Config | str | Path | None" = None,
     rig: "Rig | str | Path | None" = None,
-    rhythm: str = "inline",
+    rhythm: str = RHYTHM,
     max_frames: int | None = None,
     progress: Callable[[Progress], None] | None = None,
     origin: Mapping[str, object] | None = None,
@@ -114,7 +120,8 @@ def run(
             or mono.
         config: a `Config`, or a file to read over the preset.
         rig: a rig or rig.yaml, for recordings that do not say what is mounted where.
-        rhythm: how stages follow each other; "inline", each in turn, is the only one yet.
+        rhythm: how stages follow each other: "lockstep", mapping beside tracking, the same bytes on
+            every run; "inline", each in turn; "live", frames dropped where they come too fast.
         max_frames: stop after this many frames.
         progress: called with a `Progress` as the run goes on.
         origin: extra keys for the head of config.yaml.
@@ -145,22 +152,24 @@ def run(
     source = data if isinstance(data, Source) else _opened(data, rig)
     settings = chosen_config(preset, config, rig=source.rig)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
-    head |= ({"preset": preset} if preset else {}) | dict(origin or {})
+    head |= ({"preset": preset} if preset else {}) | dict(origin or {}) | {"rhythm": rhythm}
     outputs = Outputs(out, settings, head) if out is not None else None
 
     tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
-    with deferred_interrupt() as interrupt:
+    system = _system(source, settings, rhythm, head)
+    with deferred_interrupt() as interrupt, closing(system.worker):
         try:
-            system = _system(source, settings, rhythm)
             broken = _track(source, system, logbook, outputs, max_frames, tell, interrupt)
         except CalibrationError as error:  # found while tracking: say of which recording
             raise CalibrationError(f"{head['data']}: {error}") from error
+        result = system.finish()
         state: dict[str, object] = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
+        state |= {"rhythm": rhythm} | _dropped(system.worker)
         if broken is not None:
             state["failure"] = f"tracking stopped: {broken}"
-        finished = _concluded(source, logbook, system.finish(), outputs, state, tell)
+        finished = _concluded(source, logbook, result, outputs, state, tell)
     if broken is not None:
         kept = "" if outputs is None else f"; what was tracked before is in {outputs.folder}"
         raise type(broken)(f"{head['data']}: {broken}{kept}") from broken
@@ -222,14 +231,19 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
     return time.perf_counter() - start
 
 
-def _system(source: "Source", settings: "Config", rhythm: str) -> "Odometry":
+def _system(
+    source: "Source", settings: "Config", rhythm: str, head: Mapping[str, object]
+) -> "Odometry":
     import cv2
 
     from odomap.system.odometry import make_odometry
 
     # The stages use the cores themselves; OpenCV's own threads would only get in their way.
     cv2.setNumThreads(1)
-    return make_odometry(source.rig, settings, rhythm)
+    try:
+        return make_odometry(source.rig, settings, rhythm)
+    except CalibrationError as error:
+        raise CalibrationError(f"{head['data']}: {error}") from error
 
 
 def _track(
@@ -249,8 +263,9 @@ def _track(
     Raises:
         CalibrationError: the same, before there is a path.
     """
-    total, frames = _expected(source, max_frames), iter(source)
-    try:
+    total = _expected(source, max_frames)
+    # Closed in the end: a camera is let go, and says what there is to say of it.
+    with closing(system.worker.frames(source, interrupt)) as frames:
         for frame in frames:
             start = time.perf_counter()
             try:
@@ -266,10 +281,16 @@ def _track(
             tell(Progress("tracking", done, total, estimate, logbook.frames_per_second))
             if interrupt.is_set() or done == max_frames:
                 break
-    finally:
-        if isinstance(frames, Generator):
-            frames.close()  # a camera is let go, and says what there is to say of it
     return None
+
+
+def _dropped(worker: "Worker") -> dict[str, object]:
+    """Return what a worker left out to keep up; nothing unless live."""
+    return {
+        "frames_dropped": worker.frames_dropped,
+        "jobs_skipped": worker.jobs_skipped,
+        "messages_dropped": worker.messages_dropped,
+    }
 
 
 def _expected(source: "Source", max_frames: int | None) -> int:
@@ -288,6 +309,10 @@ def _concluded(
     """Make the numbers, write what is asked for."""
     metrics, warnings = _metrics(source, logbook, result)
     metrics |= state
+    if metrics["frames_dropped"]:
+        came = metrics["frames"] + metrics["frames_dropped"]
+        why = "tracking is slower than they come"
+        warnings.append(f"{metrics['frames_dropped']} of {came} frames were dropped: {why}")
     if outputs is not None:
         tell(Progress("writing", 0, 0))
         outputs.write(source, result, logbook, metrics, warnings)

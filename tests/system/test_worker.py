@@ -245,10 +245,10 @@ def test_outside_the_main_thread_signals_are_left_alone():
 
 @pytest.mark.parametrize("rhythm", ["inlin", ""])
 def test_a_rhythm_that_is_not_there_is_refused_by_name(rhythm):
-    with pytest.raises(ConfigError, match=r"rhythm.*inline, lockstep"):
+    with pytest.raises(ConfigError, match=r"rhythm.*inline, lockstep, live"):
         make_worker(rhythm, Stages(Map(), Track(Map(), [])))
 
 
 def test_rhythms_are_workers():
-    assert list(RHYTHMS) == ["inline", "lockstep"]
+    assert list(RHYTHMS) == ["inline", "lockstep", "live"]
     assert isinstance(make()[0], Worker)

@@ -37,8 +37,9 @@ class Run:
     """A config file, read over the preset."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
-    rhythm: Literal["inline"] = "inline"
-    """How stages follow each other: inline, each in turn."""
+    rhythm: Literal["inline", "lockstep", "live"] = "lockstep"
+    """How stages follow each other: inline, each in turn; lockstep, mapping beside tracking, and
+    still the same bytes on every run; live, at the pace of the sensor, dropping late frames."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Stop after this many frames."""
     quiet: bool = False
@@ -59,7 +60,7 @@ class Run:
             command["preset"] = self.preset
         if self.rig:
             command["rig"] = str(self.rig)
-        return track(source, out, config, command, self.max_frames, self.quiet)[0]
+        return track(source, out, config, command, self.max_frames, self.quiet, self.rhythm)[0]
 
 
 def folder_name(name: str) -> str:
@@ -74,6 +75,7 @@ def track(
     origin: dict[str, object],
     max_frames: int | None,
     quiet: bool,
+    rhythm: str = "lockstep",
 ) -> "tuple[int, RunResult]":
     """Run with progress, print the conclusion, and return the exit code with the result."""
     from odomap.run import Interrupted, run
@@ -85,6 +87,7 @@ def track(
                 source,  # type: ignore[arg-type]
                 out,
                 config=config,
+                rhythm=rhythm,
                 max_frames=max_frames,
                 progress=progress.show,
                 origin=origin,
@@ -116,6 +119,8 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
     m = result.metrics
     ms = m["ms_per_frame"]
     counts = [f"{m['tracked']} tracked", f"{m['lost']} lost"]
+    if m["frames_dropped"]:
+        counts.append(f"{m['frames_dropped']} dropped")
     if m["skipped"]:
         counts.append(f"{m['skipped']} skipped")
     lines = [("frames", f"{m['frames']}: {', '.join(counts)}")]

@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 from odomap.errors import ConfigError, nearest_name
 from odomap.system.background import ThreadConfig
+from odomap.system.live import LiveWorker
 from odomap.system.lockstep import LockstepWorker
 from odomap.system.stages import Stages
 from odomap.system.worker import InlineWorker, Worker
@@ -22,6 +23,7 @@ RHYTHMS: Mapping[str, Callable[[Stages, ThreadConfig], Worker]] = MappingProxyTy
     {
         "inline": lambda stages, _: InlineWorker(stages),
         "lockstep": LockstepWorker,
+        "live": LiveWorker,
     }
 )
 """The rhythms there are, by name."""

@@ -152,9 +152,9 @@ class Worker(ABC):
             for frame in wanted:
                 if not interrupt.is_set():
                     yield frame, self.advance(frame)
-                self.interrupted = interrupt.is_set()
-                if self.interrupted:
+                if interrupt.is_set():
                     break
+            self.interrupted = interrupt.is_set()
 
     def _tell(self, event: str, observers: list[Callable[[V], object]], value: V) -> None:
         for observer in tuple(observers):
