@@ -12,15 +12,18 @@ from odomap.backend.graphs.initialization import chordal
 from odomap.backend.graphs.solve import solve
 from odomap.files.graphs import read_graph
 
-# Rosen et al., "SE-Sync", IJRR 2019, table 1; of small grids the full matrix' eigenvalues agree.
+# Rosen et al., "SE-Sync", IJRR 2019, table 1, of those in it; of small grids the full matrix'
+# eigenvalues agree.
 OPTIMA = {
     "CSAIL": 31.70,
     "city10000": 638.6,
     "intel": 52.35,
+    "kitti_00": 125.69,
     "manhattan": 6432.0,
     "parking-garage": 1.263,
     "smallGrid3D": 1025.0,
     "sphere2500": 1687.0,
+    "sphere_bignoise_vertex3": 2961756.0,
     "tinyGrid3D": 18.52,
     "torus3D": 24230.0,
 }

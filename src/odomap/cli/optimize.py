@@ -136,9 +136,10 @@ def rows(result: "OptimizeResult") -> list[tuple[str, str]]:
     if result.certificate is not None:
         proof = result.certificate
         text = f"λ_min {proof.smallest_eigenvalue:.3g}, |S| {proof.norm:.3g}"
+        within = f"proven optimal within {proof.suboptimality:.3g} of the cost {proof.cost:.8g}"
         lines += [
             ("certificate", f"{proof.reason}  ({text})"),
-            ("", f"cost {proof.cost:.8g}; no poses cost less than {proof.lower_bound:.8g}"),
+            ("", f"{within}: no poses cost less than {proof.lower_bound:.8g}"),
         ]
     return lines + [("wrote", str(path)) for path in result.written]
 

@@ -25,7 +25,7 @@ from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.errors import InputError
 from odomap.kernels import kernel
 
-__all__ = ["chordal_cost", "chordal_costs", "isotropic_weights", "warm_up"]
+__all__ = ["chordal_cost", "chordal_costs", "isotropic_costs", "isotropic_weights", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -56,9 +56,16 @@ def chordal_costs(graph: PoseGraph) -> Array:
     if not np.isfinite(graph.Ts_world_node).all():
         raise InputError("chordal cost: poses are not known, initialise them first")
     kappa, tau = isotropic_weights(graph.information, graph.space)
-    costs = np.empty(graph.num_edges)
-    poses, edges = graph.Ts_world_node, graph.Ts_first_second
-    _costs(poses, graph.first, graph.second, edges, kappa, tau, costs)
+    edges = graph.first, graph.second, graph.Ts_first_second, kappa, tau
+    return isotropic_costs(graph.Ts_world_node, *edges)
+
+
+def isotropic_costs(
+    Ts: Array, first: Index, second: Index, Zs: Array, kappa: Array, tau: Array
+) -> Array:
+    """Return the chordal cost (E,) of edges measured as Zs (E, m, m) between poses Ts (N, m, m)."""
+    costs = np.empty(len(first))
+    _costs(Ts, first, second, Zs, kappa, tau, costs)
     return costs
 
 

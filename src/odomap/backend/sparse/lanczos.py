@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["largest_eigenvalue", "warm_up"]
+__all__ = ["largest_eigenvalue", "largest_ritz_value", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -48,12 +48,26 @@ def largest_eigenvalue(
         >>> round(largest_eigenvalue(lambda x: np.array([1.0, 2.0, 7.0]) * x, 3), 9)
         7.0
     """
+    return largest_ritz_value(multiply, size, tolerance, max_steps, seed)[0]
+
+
+def largest_ritz_value(
+    multiply: Callable[[Array], Array],
+    size: int,
+    tolerance: float = 1e-8,
+    max_steps: int = 100,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Return what `largest_eigenvalue` does, and how far at most an eigenvalue is from it.
+
+    The second is above tolerance times the first only if `max_steps` were not enough.
+    """
     steps = min(max_steps, size)
     basis = np.zeros((steps, size))
     alpha, beta = np.zeros(steps), np.zeros(steps)
     y = np.random.default_rng(seed).standard_normal(size)
     length = float(np.sqrt(np.sum(y * y)))
-    value = 0.0
+    value = error = 0.0
     for k in range(steps):
         _append(basis, k, y, length)
         y = np.array(multiply(basis[k]))  # a copy: it is written to
@@ -63,9 +77,10 @@ def largest_eigenvalue(
             np.diag(alpha[: k + 1]) + np.diag(beta[:k], 1) + np.diag(beta[:k], -1)
         )
         value = float(values[-1])
-        if length * abs(vectors[-1, -1]) <= tolerance * abs(value):
+        error = length * abs(float(vectors[-1, -1]))
+        if error <= tolerance * abs(value):
             break
-    return value
+    return value, error
 
 
 @kernel
