@@ -1,6 +1,6 @@
 """Play a recording through odomap at the pace of its sensor, as the peer's script does.
 
-    python ours.py DATA PREFIX [--frames N] [--cv-threads N] [--fast] [--set NAME=VALUE]
+    python ours.py DATA PREFIX [--frames N] [--cv-threads N] [--fast] [--rhythm R] [--set NAME=VALUE]
 
 Writes PREFIX.tum and PREFIX.json (see `meter`). A frame is read and decoded before it is due; its
 tracking starts when it is due, or at once where the system is late. `sequences.py` runs this.
@@ -17,9 +17,10 @@ from meter import Meter
 from odomap.errors import OdomapError
 from odomap.files.trajectories import write_tum
 from odomap.kernels import modules_with_kernels, warm_up
-from odomap.run import chosen_config
+from odomap.run import RHYTHM, chosen_config
 from odomap.sources.open import open as open_source
 from odomap.system.odometry import make_odometry
+from odomap.system.rhythms import RHYTHMS
 
 
 def main() -> None:
@@ -37,6 +38,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--preset", help="default the one for what the recording carries")
     parser.add_argument("--cv-threads", type=int, default=0, help="default 1, as in odomap run")
     parser.add_argument("--fast", action="store_true", help="do not wait for the sensor")
+    parser.add_argument("--rhythm", choices=RHYTHMS, default=RHYTHM)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     return parser.parse_args()
 
@@ -49,7 +51,7 @@ def play(options: argparse.Namespace) -> None:
         (name, value) for name, _, value in (text.partition("=") for text in options.set)
     ]
     config = chosen_config(options.preset, None, assignments, source.rig)
-    system = make_odometry(source.rig, config)
+    system = make_odometry(source.rig, config, options.rhythm)
     imported = set(sys.modules)
     for name in modules_with_kernels():
         if name in imported or name.startswith("odomap.geometry."):

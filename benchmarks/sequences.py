@@ -30,6 +30,8 @@ from played import SKIPPED, Played, play
 
 from odomap.evaluation.metrics import Alignment
 from odomap.files.trajectories import read_tum
+from odomap.run import RHYTHM
+from odomap.system.rhythms import RHYTHMS
 
 HERE = Path(__file__).parent
 BASELINE = HERE / "baseline.json"
@@ -122,6 +124,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--frames", type=int, default=0, help="only the first ones")
     parser.add_argument("--cv-threads", type=int, default=0, help="of Python's OpenCV, both sides")
+    parser.add_argument("--rhythm", choices=RHYTHMS, default=RHYTHM, help="of ours")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of ours")
     parser.add_argument("--score-script", default=os.environ.get("ODOMAP_SCORE_SCRIPT"))
     parser.add_argument("--json", help="write all numbers here")
@@ -133,7 +136,8 @@ def _options() -> argparse.Namespace:
         truth = Path(RECORDINGS[name].folder) / RECORDINGS[name].truth
         if not (Path(options.data) / truth).exists():
             peer.refuse(parser, f"--data: there is no {truth} in {options.data}")
-    if options.update_baseline and (options.set or options.frames or options.cv_threads):
+    changed = options.set or options.frames or options.cv_threads or options.rhythm != RHYTHM
+    if options.update_baseline and changed:
         peer.refuse(parser, "--update-baseline wants default settings and all frames")
     beside = Path(options.peer_script).with_name("score.py")
     if not options.score_script and beside.exists():
@@ -180,7 +184,7 @@ def compare(
 def run_ours(options: argparse.Namespace, recording: Recording, data: Path, prefix: Path) -> Played:
     """Play a recording to odomap, in a process of its own."""
     command = [sys.executable, str(HERE / "ours.py"), str(data), str(prefix)]
-    command += ["--preset", recording.mode]
+    command += ["--preset", recording.mode, "--rhythm", options.rhythm]
     command += ["--frames", str(options.frames), "--cv-threads", str(options.cv_threads)]
     for assignment in options.set:
         command += ["--set", assignment]
