@@ -1,6 +1,7 @@
 """Play a recording through odomap at the pace of its sensor, as the peer's script does.
 
-    python ours.py DATA PREFIX [--frames N] [--cv-threads N] [--fast] [--rhythm R] [--set NAME=VALUE]
+    python ours.py DATA PREFIX [--frames N] [--cv-threads N] [--fast] [--rhythm R]
+                   [--set NAME=VALUE]
 
 Writes PREFIX.tum and PREFIX.json (see `meter`). A frame is read and decoded before it is due; its
 tracking starts when it is due, or at once where the system is late. `sequences.py` runs this.
