@@ -89,7 +89,7 @@ def rows(result: "AdjustResult") -> list[tuple[str, str]]:
     lines = [
         ("problem", f"{counts}, {problem.num_observations} observations"),
         ("cost", f"{solution.cost_before:.8g} → {solution.cost_after:.8g}"),
-        ("residual", f"{result.rms_px:.4g} px RMS, {result.median_px:.4g} px median"),
+        ("residual", _residual(result)),
         ("iterations", f"{solution.iterations}: {solution.reason}  ({solution.method})"),
         ("time", f"{result.seconds:.3f} s"),
     ]
@@ -104,3 +104,9 @@ def rows(result: "AdjustResult") -> list[tuple[str, str]]:
     if solution.num_parts > 1:
         lines.append(("parts", f"{solution.num_parts}: not placed relative to each other"))
     return lines + [("wrote", str(path)) for path in result.written]
+
+
+def _residual(result: "AdjustResult") -> str:
+    if result.rms_px != result.rms_px:
+        return "none: nothing that is used is in sight"
+    return f"{result.rms_px:.4g} px RMS, {result.median_px:.4g} px median"

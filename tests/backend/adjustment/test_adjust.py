@@ -12,6 +12,7 @@ from odomap.backend.adjustment.reduced import Factored
 from odomap.errors import ConfigError, InputError
 from odomap.geometry.lie import se3_exp, se3_inverse, so3_log
 from odomap.geometry.robust import LOSSES, Loss
+from odomap.simulation.bundle import bundle_world
 
 HOLD = AdjustmentConfig(gauge="hold")
 EXACT = AdjustmentConfig(tolerance=1e-14)
@@ -318,3 +319,113 @@ def stretched(problem, k):
     Ts = problem.Ts_camera_world.copy()
     Ts[k, :3, :3] *= 1.1
     return Ts
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("iterations", 2.5),
+        ("rounds", "3"),
+        ("inner_iterations", None),
+        ("gate", "wide"),
+        ("tolerance", None),
+    ],
+)
+def test_a_setting_of_another_kind_is_refused(name, value):
+    with pytest.raises(ConfigError, match=rf"{name}: {value!r} must be a (whole )?number"):
+        AdjustmentConfig(**{name: value})
+
+
+def test_a_loss_by_its_name_is_refused():
+    problem, *_ = world()
+    with pytest.raises(InputError, match=r"loss: 'huber' is none: give one such as Loss"):
+        adjust(problem, loss="huber")
+
+
+def test_the_last_row_of_a_transform_is_checked():
+    problem, *_ = world()
+    Ts = problem.Ts_camera_world.copy()
+    Ts[3, 3] = 7.0
+    with pytest.raises(InputError, match=r"Ts_camera_world\[3\]: its last row is not 0 0 0 1"):
+        replace(problem, Ts_camera_world=Ts)
+
+
+def mirrored(problem, share):
+    """Return a problem with the first part of its points behind the views that first saw them."""
+    centres = se3_inverse(problem.Ts_camera_world)[:, :3, 3]
+    first = np.zeros(problem.num_points, np.int64)
+    first[problem.point[::-1]] = problem.view[::-1]
+    count = int(share * problem.num_points)
+    points = problem.points_world.copy()
+    points[:count] = 2.0 * centres[first[:count]] - points[:count]
+    return replace(problem, points_world=points)
+
+
+@pytest.mark.parametrize("gate", [0.0, 5.0])
+def test_nothing_in_sight_is_no_success(gate):
+    problem = bundle_world(60, 400).problem
+    for blind in (replace(problem, points_world=problem.points_world * 0), mirrored(problem, 1)):
+        solution = adjust(blind, AdjustmentConfig(gate=gate))
+        assert (solution.converged, solution.reason) == (False, "nothing is in sight")
+        assert np.isinf(solution.chi2).all()
+        assert solution.variance_factor == 1.0
+        np.testing.assert_array_equal(solution.points_world, blind.points_world)
+    # what has no weight is nothing, either
+    weights = np.where(problem.point < 200, 0.0, problem.weights)
+    half = replace(mirrored(replace(problem, weights=weights), 1), weights=weights)
+    assert adjust(half).reason == "nothing is in sight"
+
+
+def test_what_is_out_of_sight_does_not_make_the_rest_look_better():
+    problem = bundle_world(60, 400).problem
+    whole, half = adjust(problem), adjust(mirrored(problem, 0.5))
+    assert 0.4 < np.isinf(half.chi2).mean() < 0.6
+    assert whole.variance_factor == pytest.approx(1.0, abs=0.06)
+    assert half.variance_factor == pytest.approx(1.0, abs=0.1)
+    weights = np.where(problem.point < 200, 0.0, problem.weights)
+    light = adjust(replace(problem, weights=weights))
+    assert light.variance_factor == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("turns", ["together", "apart"])
+@pytest.mark.parametrize("share", [0.02, 0.14, 0.3])
+def test_gross_errors_are_found_by_a_gate(share, turns):
+    truth = bundle_world(60, 400)
+    rng = np.random.default_rng(9)
+    bad = rng.uniform(size=truth.problem.num_observations) < share
+    angle = np.where(turns == "apart", rng.uniform(0, 2 * np.pi, len(bad)), 0.25 * np.pi)
+    moved = bad[:, None] * 200.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    pixels = truth.problem.pixels + moved
+    solution = adjust(replace(truth.problem, pixels=pixels), AdjustmentConfig(gate=5))
+    hits = np.count_nonzero(solution.is_outlier & bad)
+    assert solution.converged
+    assert hits > 0.95 * np.count_nonzero(bad)
+    assert hits > 0.95 * np.count_nonzero(solution.is_outlier)
+    assert solution.variance_factor == pytest.approx(1.0, abs=0.1)
+    assert solution.history[0].cost == pytest.approx(solution.cost_before)
+    assert [r.iteration for r in solution.history] == list(range(solution.iterations + 1))
+
+
+@pytest.mark.parametrize("gate", [0.001, 1e-9])
+def test_a_gate_that_leaves_too_few_keeps_what_there_is(gate):
+    problem, *_ = world(points=60)
+    solution = adjust(problem, AdjustmentConfig(gate=gate))
+    assert not solution.converged
+    assert "within the gate" in solution.reason
+    assert np.isfinite(solution.points_world).all()
+    assert solution.cost_after < 0.5 * solution.cost_before
+
+
+def test_a_stop_ends_a_gated_adjustment_too():
+    problem, *_ = with_outliers()
+    flag = threading.Event()
+
+    def note(record):
+        if record.iteration == 1:
+            flag.set()
+
+    solution = adjust(problem, AdjustmentConfig(gate=4.0), stop=flag, progress=note)
+    assert solution.reason == "stopped on request"
+    assert not solution.converged
+    assert solution.iterations == 1
+    assert np.isfinite(solution.points_world).all()

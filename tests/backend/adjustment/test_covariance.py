@@ -100,6 +100,12 @@ def test_what_is_not_determined_is_told():
         view_covariance(short, [2])
     with pytest.raises(InputError, match=r"\[9\] of 6"):
         view_covariance(problem, [9])
+    for views in ("a", [0.7], [[0]], [True]):
+        with pytest.raises(InputError, match=r"views: an array .*, give \(Q,\) indices"):
+            view_covariance(problem, views)
+    with pytest.raises(InputError, match="loss: 'huber' is none"):
+        view_covariance(problem, [1], "huber")
+    assert view_covariance(problem, []).joint.shape == (0, 0)
     blind = replace(
         problem,
         **{

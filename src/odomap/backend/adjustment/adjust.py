@@ -8,9 +8,8 @@ Marquardt eliminates the points one by one (`normal`), solves what is left for t
 by a sparse factor or by conjugate gradients (`reduced`), and then betters each point for
 itself (`points`), which saves more than half of the steps.
 
-Observations beyond a gate can be left out and the rest solved again until the same ones stay; how
-sure the result is says `covariance`. Cost of a step: O(N + Σ n²) for N observations and
-points seen n times, plus that of the factor.
+Observations beyond a gate can be left out (`gate`); how sure the result is says `covariance`. Cost
+of a step: O(N + Σ n²) for N observations and points seen n times, plus that of the factor.
 
 Reference: S. Agarwal, N. Snavely, S. Seitz, R. Szeliski, "Bundle adjustment in the large",
 ECCV 2010; Y. Jeong et al., "Pushing the envelope of modern methods for bundle adjustment",
@@ -25,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.adjustment.covariance import ViewCovariance, view_covariance
-from odomap.backend.adjustment.descent import Criteria, Descent, chi2_of, state_of
+from odomap.backend.adjustment.descent import Criteria, Descent, checked_loss, chi2_of, state_of
+from odomap.backend.adjustment.gate import COARSE, LETS_GO, least_width, next_width
 from odomap.backend.adjustment.gauge import Gauge, bring_back, find_gauge
 from odomap.backend.adjustment.layout import Layout, lay_out
 from odomap.backend.adjustment.problem import Adjustment
@@ -75,6 +75,12 @@ class AdjustmentConfig:
     """Their gain, relative to the mean so far, below which they stop."""
 
     def __post_init__(self) -> None:
+        for name in ("iterations", "rounds", "inner_iterations"):
+            if not isinstance(getattr(self, name), int | np.integer):
+                raise ConfigError(f"{name}: {getattr(self, name)!r} must be a whole number")
+        for name in ("tolerance", "damping", "gate", "inner_tolerance"):
+            if not isinstance(getattr(self, name), int | float | np.number):
+                raise ConfigError(f"{name}: {getattr(self, name)!r} must be a number")
         check_limits(self)
         for name, known in (("method", METHODS), ("gauge", ("free", "hold"))):
             value = getattr(self, name)
@@ -88,7 +94,8 @@ class AdjustmentSolution:
 
     Attributes:
         problem: at the views, points and lenses found.
-        cost_before, cost_after: ½ Σ ρ of the observations used that are in sight of their lens.
+        cost_before, cost_after: ½ Σ ρ of the observations used that are in sight of their lens;
+            before, with a gate: of all that are in sight.
         iterations: steps tried.
         converged: whether there was nothing left to gain.
         reason: why it stopped, in words.
@@ -99,9 +106,9 @@ class AdjustmentSolution:
         blind_views: views that see nothing, and stayed as they were.
         unseen_points: points that no view sees, and stayed as they were.
         method: "factored" or "iterative".
-        variance_factor: χ² per degree of freedom of what was used: about 1 where weights say the
-            truth and the loss is quadratic.
-        history: one record per step.
+        variance_factor: χ² per degree of freedom of what was used and is in sight: about 1 where
+            weights say the truth and the loss is quadratic; 1 where nothing is left over.
+        history: one record per step; with a gate, costs are those of the loss of their round.
     """
 
     problem: Adjustment
@@ -156,8 +163,8 @@ def adjust(
         The best found and why it stopped; look at `converged`.
 
     Raises:
-        InputError: everything is held, fewer numbers were seen than are unknown, or lenses that
-            are none.
+        InputError: everything is held, fewer numbers were seen than are unknown, lenses that are
+            none, or a loss that is none.
 
     Example:
         >>> from odomap.simulation.bundle import bundle_world
@@ -167,27 +174,91 @@ def adjust(
         ('converged', True)
     """
     config = AdjustmentConfig() if config is None else config
-    loss = Loss() if loss is None else loss
+    loss = checked_loss(loss)
 
     def stopped() -> bool:
         return stop is not None and stop.is_set()
 
-    is_outlier = np.zeros(problem.num_observations, np.bool_)
-    found = _solve(problem, is_outlier, config, loss, stopped, progress)
-    first, history = found, found.history
-    for _ in range(config.rounds if config.gate > 0.0 else 0):
+    def solve(at: Adjustment, left_out: Mask, how: AdjustmentConfig, by: Loss) -> _Solved:
+        return _solve(at, left_out, how, by, stopped, progress)
+
+    solve_all = _solve_gated if config.gate > 0.0 else _solve_plainly
+    return solve_all(problem, config, loss, solve, stopped)
+
+
+_Solved = AdjustmentSolution
+_Solve = Callable[[Adjustment, Mask, AdjustmentConfig, Loss], AdjustmentSolution]
+
+
+class _UnsolvableError(InputError):
+    """What is seen does not tell what is unknown."""
+
+
+def _solve_plainly(
+    problem: Adjustment,
+    config: AdjustmentConfig,
+    loss: Loss,
+    solve: _Solve,
+    stopped: Callable[[], bool],
+) -> AdjustmentSolution:
+    return solve(problem, np.zeros(problem.num_observations, np.bool_), config, loss)
+
+
+def _solve_gated(
+    problem: Adjustment,
+    config: AdjustmentConfig,
+    loss: Loss,
+    solve: _Solve,
+    stopped: Callable[[], bool],
+) -> AdjustmentSolution:
+    """Solve without what is beyond the gate; keep the last solution if too little would be left."""
+    as_is = replace(config, iterations=0)
+    opening = _solve_plainly(problem, as_is, loss, solve, stopped)
+    if not (np.isfinite(opening.cost_before) and np.isfinite(opening.chi2).any()):
+        return opening
+    found, history = _let_go(opening, config, solve, stopped)
+    kept, reason = None, ""
+    for _ in range(config.rounds):
         beyond = found.chi2 > config.gate * config.gate
-        if np.array_equal(beyond, is_outlier) or beyond.all() or stopped():
+        if kept is not None and (stopped() or np.array_equal(beyond, kept.is_outlier)):
             break
-        is_outlier = beyond
-        found = _solve(found.problem, is_outlier, config, loss, stopped, progress)
+        if beyond.all():
+            reason = "nothing is within the gate"
+            break
+        try:
+            found = kept = solve(found.problem, beyond, config, loss)
+        except _UnsolvableError as error:
+            told = str(error).removeprefix("adjust: ").partition(": ")[0]
+            reason = f"too few are within the gate: {told}"
+            break
         history += found.history[1:]
+    if kept is None:
+        kept = _solve_plainly(found.problem, as_is, loss, solve, stopped)
     return replace(
-        found,
-        cost_before=first.cost_before,
+        kept,
+        cost_before=opening.cost_before,
         iterations=len(history) - 1,
+        converged=kept.converged and not reason,
+        reason=reason or kept.reason,
         history=tuple(replace(r, iteration=i) for i, r in enumerate(history)),
     )
+
+
+def _let_go(
+    opening: AdjustmentSolution,
+    config: AdjustmentConfig,
+    solve: _Solve,
+    stopped: Callable[[], bool],
+) -> tuple[AdjustmentSolution, tuple[IterationRecord, ...]]:
+    """Solve by a loss that lets go of gross errors, of ever smaller width."""
+    found, history, width = opening, opening.history, np.inf
+    coarse = replace(config, tolerance=max(config.tolerance, COARSE))
+    while width > least_width(config.gate) and not stopped():
+        width = next_width(found.chi2, found.problem.weights, config.gate, width)
+        how = coarse if width > least_width(config.gate) else config
+        found = solve(found.problem, opening.is_outlier, how, Loss(LETS_GO, width))
+        history += found.history[1:]
+    return found, history
 
 
 def _solve(
@@ -202,7 +273,7 @@ def _solve(
     used = _without(problem, is_outlier) if is_outlier.any() else problem
     gauge = find_gauge(used)
     layout = lay_out(used)
-    surplus = _surplus(used, layout, gauge)
+    _check_surplus(used, layout, gauge)
     reduced = reduced_solver(
         layout, used.lens, config.method, config.inner_iterations, config.inner_tolerance
     )
@@ -213,7 +284,6 @@ def _solve(
     if config.gauge == "hold":
         moved = bring_back(problem, moved, gauge)
     chi2 = chi2_of(moved) if is_outlier.any() else account.chi2
-    known = account.chi2[np.isfinite(account.chi2)]
     sees = np.bincount(used.view, minlength=used.num_views) > 0
     seen = np.bincount(used.point, minlength=used.num_points) > 0
     return AdjustmentSolution(
@@ -229,7 +299,7 @@ def _solve(
         np.flatnonzero(~sees),
         np.flatnonzero(~seen),
         reduced.name,
-        float(known.sum() / surplus) if surplus > 0 else 1.0,
+        _variance_factor(used, account.chi2),
         account.history,
     )
 
@@ -246,19 +316,32 @@ def _without(problem: Adjustment, is_outlier: Mask) -> Adjustment:
     )
 
 
-def _surplus(problem: Adjustment, layout: Layout, gauge: Gauge) -> int:
-    """Return how many more numbers were seen than are unknown; raise InputError if fewer."""
+def _check_surplus(problem: Adjustment, layout: Layout, gauge: Gauge) -> None:
+    """Refuse a problem with fewer numbers seen than are unknown."""
     free = int(np.count_nonzero(~layout.blocks.is_held))
     unknown = free + 3 * int(np.count_nonzero(layout.is_free_point))
     if unknown == 0:
-        raise InputError("adjust: every view, point and lens that is seen is held: free some")
+        raise _UnsolvableError("adjust: every view, point and lens that is seen is held: free some")
     rows = 2 * int(np.count_nonzero(problem.weights > 0.0))
-    surplus = rows - unknown + int(np.count_nonzero(gauge.is_held))
-    if surplus < 0:
-        raise InputError(
+    if rows - unknown + int(np.count_nonzero(gauge.is_held)) < 0:
+        raise _UnsolvableError(
             f"adjust: {rows} numbers were seen, {unknown} are unknown: hold views, points or lenses"
         )
-    return surplus
+
+
+def _variance_factor(problem: Adjustment, chi2: Array) -> float:
+    """Return χ² per degree of freedom of the observations that count and are in sight."""
+    is_lost = ~np.isfinite(chi2) | (problem.weights == 0.0)
+    if is_lost.all():
+        return 1.0
+    counted = _without(problem, is_lost)
+    # A point seen once has three unknowns, of which two numbers tell two.
+    told = np.minimum(3, 2 * np.bincount(counted.point, minlength=counted.num_points))
+    unknown = int(told[~counted.is_fixed_point].sum())
+    unknown += int(np.count_nonzero(~lay_out(counted).blocks.is_held))
+    surplus = 2 * counted.num_observations - unknown
+    surplus += int(np.count_nonzero(find_gauge(counted).is_held))
+    return float(chi2[~is_lost].sum() / surplus) if surplus > 0 else 1.0
 
 
 def _moved(problem: Adjustment, descent: Descent, layout: Layout) -> Adjustment:

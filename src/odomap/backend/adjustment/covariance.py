@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from odomap.backend.adjustment.descent import Descent, state_of
+from odomap.backend.adjustment.descent import Descent, checked_loss, state_of
 from odomap.backend.adjustment.gauge import find_gauge
 from odomap.backend.adjustment.layout import lay_out
 from odomap.backend.adjustment.problem import Adjustment
@@ -75,16 +75,22 @@ def view_covariance(
     Raises:
         InputError: a view that does not exist or sees nothing, or one not held by what it sees.
     """
-    chosen = np.atleast_1d(np.asarray(views, np.int64))
+    given = np.atleast_1d(np.asarray(views))
+    if given.ndim != 1 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
+        raise InputError(
+            f"view covariance: views: an array {given.shape} of {given.dtype}, give (Q,) indices"
+        )
+    chosen = given.astype(np.int64)
+    loss = checked_loss(loss)
     gauge = find_gauge(problem)
     bad = (chosen < 0) | (chosen >= problem.num_views)
-    if chosen.ndim != 1 or bad.any():
+    if bad.any():
         raise InputError(f"view covariance: views: {chosen[bad][:1]} of {problem.num_views}")
     if (gauge.part[chosen] < 0).any():
         raise InputError(f"view covariance: view {chosen[gauge.part[chosen] < 0][0]} sees nothing")
     layout = lay_out(problem, gauge.is_held)
     reduced = Factored(layout, problem.lens)
-    descent = Descent(state_of(problem, layout), layout, loss or Loss(), reduced)
+    descent = Descent(state_of(problem, layout), layout, loss, reduced)
     values, _ = reduced.assemble(descent.linearise(0.0), 0.0)
     if not reduced.factor.factor(values):
         raise InputError(

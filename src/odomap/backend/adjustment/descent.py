@@ -38,7 +38,16 @@ from odomap.errors import InputError
 from odomap.geometry.robust import Loss
 from odomap.geometry.robust_kernels import loss_code
 
-__all__ = ["Account", "Criteria", "Descent", "State", "chi2_of", "room_for", "state_of"]
+__all__ = [
+    "Account",
+    "Criteria",
+    "Descent",
+    "State",
+    "checked_loss",
+    "chi2_of",
+    "room_for",
+    "state_of",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -88,6 +97,17 @@ class Account:
     reason: str
     chi2: Array
     history: tuple[IterationRecord, ...]
+
+
+def checked_loss(loss: Loss | None) -> Loss:
+    """Return a loss, quadratic if none is given.
+
+    Raises:
+        InputError: it is something else, such as a name.
+    """
+    if loss is not None and not isinstance(loss, Loss):
+        raise InputError(f"adjustment: loss: {loss!r} is none: give one such as Loss('huber')")
+    return Loss() if loss is None else loss
 
 
 def state_of(problem: Adjustment, layout: Layout) -> State:
@@ -253,6 +273,9 @@ class Descent:
         record(0.0)
         if not np.isfinite(before):
             reason = "the cost is not finite at the start"
+            return Account(before, before, 0, False, reason, self._unsorted(), tuple(history))
+        if not (np.isfinite(self.chi2) & (self.layout.seen.weight > 0.0)).any():
+            reason = "nothing is in sight"
             return Account(before, before, 0, False, reason, self._unsorted(), tuple(history))
         damping, growth = criteria.damping, 2.0
         reason, converged = f"{criteria.iterations} iterations were spent", False

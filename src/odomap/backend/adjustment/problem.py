@@ -36,6 +36,8 @@ BAL = "bal"
 
 _ROTATION = 1e-4
 """How far RᵀR may be from I."""
+_BELOW = 1e-9
+"""How far the last row of a transform may be from 0 0 0 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +150,10 @@ class Adjustment:
         if error.max() > _ROTATION or np.linalg.det(R).min() < 0:
             bad = int(np.argmax(np.where(np.linalg.det(R) < 0, np.inf, error)))
             raise InputError(f"adjustment: Ts_camera_world[{bad}] is not a rotation and a place")
+        below = np.abs(self.Ts_camera_world[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+        if below.max() > _BELOW:
+            bad = int(np.argmax(below))
+            raise InputError(f"adjustment: Ts_camera_world[{bad}]: its last row is not 0 0 0 1")
         if self.weights.min() < 0:
             raise InputError("adjustment: weights: a standard deviation is not negative")
         if len(self.models) != len(self.intrinsics):
