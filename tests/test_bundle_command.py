@@ -1,5 +1,6 @@
 """`odomap bundle` as a person uses it: what it prints and writes, its exit codes, bad input."""
 
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,34 @@ def test_gross_errors_are_left_out_or_made_light_of(cli, problem, world):
     assert float(light.split()[3]) < float(plain.split()[3])
 
 
+def test_nothing_in_sight_is_no_success(cli, problem):
+    given = read_bal(problem)
+    # a lens of BAL sees before and behind itself, but not in its own plane
+    flat = given.points_world * [1.0, 1.0, 0.0]
+    together = np.tile(np.eye(4), (given.num_views, 1, 1))
+    write_bal("blind.txt", replace(given, points_world=flat, Ts_camera_world=together))
+    code, out, err = cli("bundle", "blind.txt")
+    assert code == 1
+    assert err == "odomap: not converged: nothing is in sight\n"
+    assert "nan" not in out
+    assert lines_of(out)["residual"] == "none: nothing that is used is in sight"
+
+
+def test_gross_errors_alone_are_no_reason_to_give_up(cli, problem, world):
+    wrong = world.problem.pixels.copy()
+    wrong[::50] += 200.0
+    write_bal(problem, replace(world.problem, weights=1.0, pixels=wrong))
+    code, out, _ = cli("bundle", problem, "--gate", "2.5")
+    assert code == 0
+    count, what = lines_of(out)["left out"].split(" ", 1)
+    assert what == "observations beyond the gate"
+    assert len(wrong[::50]) <= int(count) <= len(wrong[::50]) + 3
+    code, _, err = cli("bundle", problem, "--gate", "0.001", "--out", "best.txt")
+    assert code == 1
+    assert err.startswith("odomap: not converged: too few are within the gate: ")
+    assert np.isfinite(read_bal("best.txt").points_world).all()
+
+
 def test_ctrl_c_keeps_the_best_so_far(cli, problem, monkeypatch):
     def interrupting(self: Steps, done: int, total: int, text: str) -> None:
         if done == 1 and text.startswith("cost"):
@@ -133,10 +162,15 @@ def test_one_that_does_not_converge_is_written_all_the_same(cli, problem):
             ["problem.txt", "--fix-cameras", "--fix-points", "--fix-intrinsics"],
             "problem.txt: ",
         ),
+        (["problem.txt", "--out", "a.txt", "--cloud", "b/../a.txt"], "b/../a.txt: two results"),
+        (["problem.txt", "--out", "folder"], "folder: cannot be written: a folder of that name"),
+        (["problem.txt", "--cloud", "pipe"], "pipe: cannot be written: it is a device, a pipe"),
         (["problem.txt", "--fix-intrinsic"], "(did you mean '--fix-intrinsics'?)"),
     ],
 )
 def test_bad_input_is_one_line(cli, problem, words, message):
+    os.mkfifo("pipe")
+    Path("folder").mkdir()
     Path("cut.txt").write_text(Path(problem).read_text()[:-400])
     code, out, err = cli("bundle", *words)
     assert (code, out) == (2, "")

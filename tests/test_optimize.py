@@ -1,5 +1,6 @@
 """`odomap optimize` as a person uses it: what it prints and writes, its exit codes, bad input."""
 
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from odomap.backend.graphs.posegraph import PoseGraph
+from odomap.backend.graphs.posegraph import PoseGraph, Priors
 from odomap.cli import main
 from odomap.cli.progress import Steps
 from odomap.errors import InputError
@@ -236,6 +237,11 @@ def test_lines_passed_over_are_told(cli):
         (["ring.g2o", "--certify", "--cost", "geodesic"], "the proof is of the chordal cost"),
         (["ring.g2o", "--certify", "--loss", "huber"], "no proof with a robust loss"),
         (["ring.g2o", "--out", "ring.g2o"], "ring.g2o: is the input itself"),
+        (["ring.g2o", "--out", "a.png"], "a.png: two results would go into this file"),
+        (["ring.g2o", "--out", "folder"], "folder: cannot be written: a folder of that name"),
+        (["ring.g2o", "--out", "a.g2o", "--plot", "folder.png"], "folder.png: cannot be written: "),
+        (["ring.g2o", "--out", "pipe"], "pipe: cannot be written: it is a device, a pipe"),
+        (["far.g2o", "--robust", "gnc"], "far.g2o: edge 58 (19-39) is 1e+200 m long: remove it"),
         (["ring.g2o", "--plot", "a.pdf"], "--plot a.pdf: only PNG is drawn"),
         (["ring.g2o", "--max-iterations", "-1"], "iterations"),
         (["edges.g2o", "--initial", "given"], "edges.g2o: solve: initial 'given' asks for poses"),
@@ -250,12 +256,30 @@ def test_bad_input_is_one_line(cli, words, message):
     write_g2o("edges.g2o", circle(is_known=False))
     held = np.isin(ring.ids, [0, 9])
     write_g2o("held.g2o", replace(ring, is_fixed=held))
+    Zs = ring.Ts_first_second.copy()
+    Zs[-1, 0, 2] = 1e200  # squares of squares of it are no numbers
+    write_g2o("far.g2o", replace(ring, Ts_first_second=Zs))
+    os.mkfifo("pipe")
+    Path("folder").mkdir()
+    Path("folder.png").mkdir()
     Path("bad.g2o").write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 x 0 0 1 0 0 1 0 1\n")
     code, out, err = cli("optimize", *words)
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1
     assert message in err
-    assert not list(Path().glob("*.png"))
+    assert [path.name for path in Path().glob("*.png")] == ["folder.png"]
+    assert not Path("a.g2o").exists()
+
+
+def test_priors_alone(cli):
+    ring = circle("SE3")
+    rest = ring.without(np.ones(ring.num_edges, bool))
+    tied = replace(rest, priors=Priors(np.arange(40), ring.Ts_world_node, ring.information[:40]))
+    for poses in (ring.Ts_world_node, np.full_like(ring.Ts_world_node, np.nan)):
+        write_g2o("tied.g2o", replace(tied, Ts_world_node=poses))
+        assert read_g2o("tied.g2o").num_edges == 0
+        assert cli("optimize", "tied.g2o", "--out", "best.g2o")[0] == 0
+        np.testing.assert_allclose(read_g2o("best.g2o").positions, ring.positions, atol=1e-9)
 
 
 def test_from_python(tmp_path):

@@ -90,8 +90,7 @@ def adjust_file(
     tell = progress or (lambda *_: None)
     config = AdjustmentConfig(method=method, iterations=max_iterations, gate=gate)
     problem = read_bal(path)
-    for file in (out, cloud):
-        check_out(path, file)
+    check_out(path, out, cloud)
     problem = replace(
         problem,
         is_free_intrinsic=np.full(problem.intrinsics.shape, not fix_intrinsics),

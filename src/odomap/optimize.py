@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 __all__ = ["OptimizeResult", "optimize", "picture_beside"]
 
 
+FARTHEST = 1e70
+"""Metres; squares of squares of what is measured must be numbers, too."""
+
+
 @dataclass(frozen=True)
 class OptimizeResult:
     """What an optimisation found.
@@ -86,7 +90,7 @@ def optimize(
         certify: whether to prove that no poses are better, by the chordal cost.
         max_iterations: most steps.
         skip_unknown: whether lines of unknown tags are passed over.
-        picture: PNG file for a picture of before and after.
+        picture: PNG file for a picture of before and after; none is drawn without an edge.
         progress: called with (done, total, text).
 
     Raises:
@@ -108,8 +112,7 @@ def optimize(
     cost = _checked_cost(cost, loss, certify)
     config = SolverConfig(method=method, iterations=max_iterations)
     file = _opened(graph, skip_unknown)
-    for target in (out, picture):
-        check_out(graph, target)
+    check_out(graph, out, picture)
     if out is not None:
         check_graph_file(out, file.graph)
     compile_imported(tell)
@@ -117,6 +120,8 @@ def optimize(
         try:
             if certify:
                 check_certifiable(file.graph)
+            if robust is not None:
+                _check_lengths(file.graph)
             start = time.perf_counter()
             solution = solve(
                 file.graph,
@@ -168,6 +173,15 @@ def _opened(graph: str | Path | PoseGraph, skip_unknown: bool) -> GraphFile:
     return read_graph_file(graph, skip_unknown)
 
 
+def _check_lengths(graph: PoseGraph) -> None:
+    """Refuse edges whose covariances, carried along them, are no numbers."""
+    length = np.abs(graph.Ts_first_second[:, : graph.space, graph.space]).max(axis=1)
+    if (length > FARTHEST).any():
+        edge = int(np.argmax(length))
+        name = f"edge {edge} ({graph.ids[graph.first[edge]]}-{graph.ids[graph.second[edge]]})"
+        raise InputError(f"{name} is {length[edge]:.3g} m long: remove it, or leave out robust")
+
+
 def _sizes(graph: PoseGraph) -> tuple[int, ...]:
     """Return how many nodes each connected component has, the largest first."""
     from odomap.backend.graphs.components import find_components
@@ -183,7 +197,7 @@ def _write(
     if out is not None:
         write_graph(out, solution.graph)
         written.append(Path(out))
-    if picture is not None:
+    if picture is not None and solution.graph.num_edges:
         from odomap.views.graphs import graph_figure
         from odomap.views.style import figure_png
 

@@ -1,8 +1,8 @@
 """What a solver on files needs around it: kernels compiled before the clock runs, safe results.
 
 A descent of milliseconds is preceded by kernels that compile once for seconds, and followed by
-files that must be writable, must not be the input, and must hold all that was read. All of that is
-made sure before the work begins.
+files that must be writable, must not be the input nor each other, and must hold all that was read.
+All of that is made sure before the work begins.
 """
 
 import sys
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from odomap.errors import InputError
-from odomap.files.atomic import make_folder
+from odomap.files.atomic import find_obstacle, make_folder
 from odomap.kernels import modules_with_kernels, warm_up
 
 __all__ = ["Tell", "check_out", "compile_imported"]
@@ -30,20 +30,25 @@ def compile_imported(tell: Tell) -> None:
         warm_up(name)
 
 
-def check_out(given: object, out: str | Path | None) -> None:
-    """Make sure that a result can be written, and does not replace what it is made from.
+def check_out(given: object, *outs: str | Path | None) -> None:
+    """Make sure that results can be written, and replace neither their source nor each other.
 
     Args:
         given: the input, if it is a path.
-        out: where the result goes; None is nowhere.
+        outs: where the results go; None is nowhere.
 
     Raises:
-        InputError: both are the same file.
+        InputError: two of them are the same file, or one is there and is no regular file.
         OutputError: there is no writing there.
     """
-    if out is None:
-        return
-    file = Path(out)
-    if isinstance(given, str | Path) and file.exists() and file.samefile(given):
-        raise InputError(f"{file}: is the input itself: choose another file")
-    make_folder(file.parent)
+    files = [Path(out) for out in outs if out is not None]
+    for index, file in enumerate(files):
+        if isinstance(given, str | Path) and file.exists() and file.samefile(given):
+            raise InputError(f"{file}: is the input itself: choose another file")
+        if file.resolve() in [other.resolve() for other in files[:index]]:
+            raise InputError(f"{file}: two results would go into this file: give each its own")
+        obstacle = find_obstacle(file)
+        if obstacle is not None:
+            raise InputError(f"{file}: cannot be written: {obstacle}")
+    for file in files:
+        make_folder(file.parent)

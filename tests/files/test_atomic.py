@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 
 from odomap.errors import OutputError
-from odomap.files.atomic import atomic_binary, atomic_text, make_folder, write_bytes, write_text
+from odomap.files.atomic import (
+    atomic_binary,
+    atomic_text,
+    find_obstacle,
+    make_folder,
+    write_bytes,
+    write_text,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -134,3 +141,55 @@ def test_make_folder_without_permission(tmp_path: Path) -> None:
             make_folder(tmp_path)
     finally:
         tmp_path.chmod(0o700)
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    path = tmp_path / "pipe.g2o"
+    os.mkfifo(path)
+    return path
+
+
+def test_only_regular_files_are_replaced(tmp_path: Path, pipe: Path) -> None:
+    (tmp_path / "link.g2o").symlink_to(pipe)
+    for name in ("pipe.g2o", "link.g2o"):
+        with pytest.raises(OutputError, match=rf"{name}: .* it is a device, a pipe or"):
+            write_bytes(tmp_path / name, b"x")
+    assert pipe.is_fifo()
+    assert (tmp_path / "link.g2o").is_symlink()
+    assert names(tmp_path) == ["link.g2o", "pipe.g2o"]
+
+
+def test_what_is_in_the_way(tmp_path: Path, pipe: Path) -> None:
+    (tmp_path / "old").write_text("old")
+    (tmp_path / "link").symlink_to("old")
+    (tmp_path / "nowhere").symlink_to("missing")
+    for name in ("old", "link", "nowhere", "new", "old/inside", "no/where"):
+        assert find_obstacle(tmp_path / name) is None
+    assert "a folder of that name" in str(find_obstacle(tmp_path))
+    assert "a pipe" in str(find_obstacle(pipe))
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
+def test_a_file_that_is_open_is_not_replaced_by_its_number(tmp_path: Path) -> None:
+    with open(tmp_path / "log", "w") as file:
+        (tmp_path / "out").symlink_to(f"/proc/self/fd/{file.fileno()}")
+        assert "a pipe" in str(find_obstacle(tmp_path / "out"))
+        with pytest.raises(OutputError, match="out: cannot be written"):
+            write_text(tmp_path / "out", "x")
+    assert names(tmp_path) == ["log", "out"]
+
+
+def test_a_folder_that_takes_no_files_is_not_said_to_be_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Path, data: bytes) -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(OutputError, match="no files can be made there"):
+        make_folder(tmp_path)
+    monkeypatch.undo()
+    monkeypatch.setattr(os, "replace", lambda a, b: refuse(Path(a), b""))
+    with pytest.raises(OutputError, match="no files can be made there"):
+        write_text(tmp_path / "a.txt", "x")

@@ -1,6 +1,7 @@
 """Pose graphs survive the way through g2o text, and a broken line is named by its number."""
 
 import gzip
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -370,10 +371,34 @@ def test_what_no_file_could_say_is_not_written(tmp_path):
     Ts[1] = np.nan
     with pytest.raises(InputError, match="the pose of vertex 1 is not known: solve first"):
         write_g2o(tmp_path / "b.g2o", graph.placed(Ts))
-    twice = PoseGraph("SE2", Ts[[0, 0]], [0], [1], Ts[:1], [np.eye(3)], ids=[4, 4])
+    point = Sights([[1.0, 2.0]], [4], [0], [0], [[1.0, 2.0]], [np.eye(2)])
+    tied = ([0], [1], Ts[:1], [np.eye(3)])
+    twice = PoseGraph("SE2", Ts[[0, 0]], *tied, ids=[4, 5], points=point)
     with pytest.raises(InputError, match="two vertices have the name 4"):
         write_g2o(tmp_path / "b.g2o", twice)
     alone = PoseGraph("SE2", np.full((3, 3, 3), np.nan), [0], [1], Ts[:1], [np.eye(3)])
     with pytest.raises(InputError, match="the pose of vertex 2 is not known"):
         write_graph(tmp_path / "b.g2o", alone)
     assert not (tmp_path / "b.g2o").exists()
+
+
+@pytest.mark.parametrize("group", ["SE2", "SE3", "Sim3"])
+def test_priors_alone_are_a_graph(group, tmp_path):
+    whole = world(group)
+    d, index = GROUPS[group].space, np.zeros(0, np.int64)
+    none = Sights(np.zeros((0, d)), index, index, index, np.zeros((0, d)), np.zeros((0, d, d)))
+    alone = replace(whole.without(np.ones(whole.num_edges, bool)), points=none)
+    write_g2o(tmp_path / "a.g2o", alone)
+    found = read_g2o(tmp_path / "a.g2o")
+    assert (found.num_edges, found.num_nodes) == (0, whole.num_nodes)
+    np.testing.assert_array_equal(found.priors.node, whole.priors.node)
+    np.testing.assert_allclose(found.priors.information, whole.priors.information, rtol=1e-12)
+
+
+def test_a_message_names_its_file_once(tmp_path):
+    path = tmp_path / "a.g2o"
+    path.write_text(f"EDGE_SE2 0 1 1 0 0 {I2}\nFIX 0\n")
+    with pytest.raises(InputError, match="FIX 0: its pose is not in the file") as error:
+        read_g2o(path)
+    assert str(error.value).startswith(f"{path}:2: FIX 0: ")
+    assert str(error.value).count("a.g2o") == 1

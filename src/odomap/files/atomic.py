@@ -2,8 +2,9 @@
 
 A file is written beside its target, flushed to the disk, and renamed over it. POSIX makes the
 rename atomic, so a reader, a crash or a full disk never meets half a file, and an old result
-survives a failed new one. What the operating system complains about is raised as an `OutputError`
-that names the file and the mend.
+survives a failed new one. A rename would replace a device or a pipe, too, and break it for all who
+use it: only regular files are replaced. What the operating system complains about is raised as an
+`OutputError` that names the file and the mend.
 
 Reference: T. S. Pillai et al., "All file systems are not created equal: on the complexity of
 crafting crash-consistent applications", OSDI 2014.
@@ -12,6 +13,7 @@ crafting crash-consistent applications", OSDI 2014.
 import errno
 import io
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +21,14 @@ from typing import BinaryIO, TextIO
 
 from odomap.errors import OutputError
 
-__all__ = ["atomic_binary", "atomic_text", "make_folder", "write_bytes", "write_text"]
+__all__ = [
+    "atomic_binary",
+    "atomic_text",
+    "find_obstacle",
+    "make_folder",
+    "write_bytes",
+    "write_text",
+]
 
 _MENDS = {
     errno.ENOSPC: "the disk is full: free some space, or choose another folder with --out",
@@ -44,9 +53,13 @@ def atomic_binary(path: str | Path) -> Iterator[BinaryIO]:
         path: the target; its folder must exist.
 
     Raises:
-        OutputError: the operating system refuses (disk full, no permission, ...).
+        OutputError: the operating system refuses (disk full, no permission, ...), or the target is
+            there and is no regular file.
     """
     target = Path(path)
+    obstacle = find_obstacle(target)
+    if obstacle is not None:
+        raise OutputError(f"{target}: cannot be written: {obstacle}")
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         try:
@@ -60,7 +73,7 @@ def atomic_binary(path: str | Path) -> Iterator[BinaryIO]:
     except OSError as error:
         if error.filename not in (None, str(beside), os.fspath(beside)):
             raise
-        raise _output_error(target, error) from error
+        raise _output_error(target, error, target.parent.is_dir()) from error
 
 
 @contextmanager
@@ -92,6 +105,20 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def find_obstacle(path: str | Path) -> str | None:
+    """Return why a file must not replace what is under a name, in words; None if it may."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:
+        # Nothing is there, or what keeps it from being seen keeps it from being written, too.
+        return None
+    if stat.S_ISDIR(mode):
+        return _MENDS[errno.EISDIR]
+    if not stat.S_ISREG(mode) or _leads_to_open_file(Path(path)):
+        return "it is a device, a pipe or a socket, not a file: choose another name with --out"
+    return None
+
+
 def make_folder(path: str | Path) -> Path:
     """Create a folder with its parents, and make sure that files can be written in it.
 
@@ -110,8 +137,17 @@ def make_folder(path: str | Path) -> Path:
         finally:
             _remove(probe)
     except OSError as error:
-        raise _output_error(folder, error) from error
+        raise _output_error(folder, error, True) from error
     return folder
+
+
+def _leads_to_open_file(path: Path) -> bool:
+    """Whether a name such as /dev/stdout stands for a file that a process has open."""
+    while path.is_symlink():
+        if Path(os.path.realpath(path.parent)).parts[:2] == ("/", "proc"):
+            return True
+        path = path.parent / os.readlink(path)
+    return False
 
 
 def _remove(path: Path) -> None:
@@ -122,6 +158,8 @@ def _remove(path: Path) -> None:
         return
 
 
-def _output_error(target: Path, error: OSError) -> OutputError:
+def _output_error(target: Path, error: OSError, has_folder: bool) -> OutputError:
     mend = _MENDS.get(error.errno or 0, error.strerror or str(error))
+    if error.errno == errno.ENOENT and has_folder:
+        mend = "no files can be made there: choose another folder with --out"
     return OutputError(f"{target}: cannot be written: {mend}")

@@ -62,7 +62,7 @@ class Parts:
         Raises:
             InputError: names the line that names what is not there, or holds what cannot be.
         """
-        if not len(self.edges) and not len(self.sights):
+        if not (len(self.edges) or len(self.sights) or len(self.priors)):
             raise InputError(f"{self.file}: has no edges: there is nothing to solve")
         ends = [(self.edges, 0), (self.edges, 1), (self.priors, 0), (self.sights, 0)]
         nodes = self._declared(self.nodes, [*ends, (self.fixed, 0)])
@@ -84,10 +84,11 @@ class Parts:
             self.sights.numbers[:, :d],
             full_matrices(self.sights.numbers[:, d:], d),
         )
+        placed = self._placed(nodes)
         try:
             return PoseGraph(
                 self.group,
-                self._placed(nodes),
+                placed,
                 first,
                 second,
                 poses,
