@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphworlds import DIM, INVERSE, with_landmarks, world
+from graphworlds import DIM, EXP, INVERSE, with_landmarks, world
 from loopworlds import passed_again
 from odomap.backend.descent import SolverConfig
 from odomap.backend.graphs.gnc import GncConfig, find_inliers, graduated_weights
-from odomap.backend.graphs.posegraph import Priors
+from odomap.backend.graphs.posegraph import PoseGraph, Priors
 from odomap.backend.graphs.solve import solve
 from odomap.backend.graphs.subgraph import Subgraph
 from odomap.errors import ConfigError
@@ -158,6 +158,48 @@ def test_the_same_graph_gives_the_same_bytes():
     one, other = find_inliers(added), find_inliers(added)
     assert one.Ts_world_node.tobytes() == other.Ts_world_node.tobytes()
     assert one.is_inlier.tobytes() == other.is_inlier.tobytes()
+
+
+def streets(seed, num_false, poses=400, reach=10):
+    """Return a random walk through streets whose odometry turns too unsurely to confirm a loop."""
+    rng, at, ahead, seen = np.random.default_rng(seed), np.zeros(2), np.array([1.0, 0.0]), {}
+    walk, pairs = [], []
+    for pose in range(poses):
+        place = tuple(at.tolist())
+        pairs += [(seen[place], pose)] if place in seen else []
+        seen[place] = pose
+        turns = [ahead] * 3 + [ahead[::-1] * (-1, 1), ahead[::-1] * (1, -1)]
+        turns = [way for way in turns if np.abs(at + way).max() <= reach]
+        ahead = turns[rng.integers(len(turns))]
+        walk.append((*at, np.arctan2(ahead[1], ahead[0])))
+        at = at + ahead
+    walk = np.array(walk)
+    Ts = EXP["SE2"](walk * [0, 0, 1])
+    Ts[:, :2, 2] = walk[:, :2]
+    false = np.stack(
+        [rng.integers(0, poses // 2, num_false), rng.integers(poses // 2, poses, num_false)]
+    )
+    steps = np.stack([np.arange(poses - 1), np.arange(1, poses)])
+    first, second = np.concatenate([steps, np.array(pairs).T, false], axis=1)
+    sigma = np.tile([0.05, 0.05, 0.03], (len(first), 1))
+    sigma[: poses - 1, 2] = 0.1
+    motion = INVERSE["SE2"](Ts[first]) @ Ts[second]
+    is_false = np.arange(len(first)) >= len(first) - num_false
+    motion[is_false] = np.eye(3)
+    measured = motion @ EXP["SE2"](rng.normal(0.0, sigma))
+    unknown = np.full_like(Ts, np.nan)
+    return PoseGraph(
+        "SE2", unknown, first, second, measured, np.eye(3) / sigma[:, None] ** 2
+    ), is_false
+
+
+@pytest.mark.parametrize(("seed", "num_false"), [(0, 20), (2, 20), (4, 20), (1, 40)])
+def test_true_loops_left_out_at_first_come_in_when_the_graph_is_surer(seed, num_false):
+    graph, is_false = streets(seed, num_false)
+    is_true = graph.is_loop & ~is_false
+    found = find_inliers(graph)
+    assert found.is_inlier[is_true].mean() > 0.96
+    assert found.is_inlier[is_false].sum() <= 1
 
 
 def test_limits_of_the_config():
