@@ -16,12 +16,11 @@ from odomap.backend.graphs.graphproblem import GraphProblem
 from odomap.backend.sparse.blockcholesky import BlockCholesky
 
 PHASES: tuple[tuple[object, str, str], ...] = (
-    (solving, "_order", "ordering"),
+    (solving, "node_factor", "ordering"),
     (solving, "find_components", "layout"),
     (GraphProblem, "__init__", "layout"),
     (BlockCholesky, "__init__", "symbolic"),
-    (solving, "chordal", "initialisation"),
-    (solving, "_start", "initialisation"),
+    (solving, "choose_start", "initialisation"),
     (GraphProblem, "linearise", "linearise"),
     (BlockCholesky, "factor", "numeric factor"),
     (BlockCholesky, "solve", "triangular solves"),
