@@ -76,3 +76,9 @@ def test_the_legend_stays_on_the_paper():
 def test_the_end_alone():
     figure = graph_figure(ring(2))
     assert len(figure.axes) == 1
+
+
+def test_nodes_that_nothing_ties_are_dots():
+    graph = ring(2).without(np.ones(21, bool))
+    (after,) = graph_figure(graph).axes
+    assert [text.get_text() for text in after.get_legend().get_texts()] == ["node", "landmark"]

@@ -60,7 +60,8 @@ def graph_figure(
         _draw(ax, after, positions, oblique, none if rejected is None else rejected)
     _draw_landmarks(axes[-1], after.points.points_world, oblique)
     handles, labels = axes[-1].get_legend_handles_labels()
-    legend(axes[-1], handles=handles, labels=labels, ncols=4)
+    if handles:
+        legend(axes[-1], handles=handles, labels=labels, ncols=4)
     return figure
 
 
@@ -85,6 +86,9 @@ def _draw(ax: Axes, graph: PoseGraph, positions: Array, oblique: bool, rejected:
             lines = LineCollection(list(some), colors=colour, linewidths=width, zorder=order)
             lines.set_label(label)
             ax.add_collection(lines)
+    if not len(ends):  # nodes that only priors or landmarks tie
+        style = {"marker": "s", "ms": 2.5, "ls": "", "color": PALETTE["estimate"]}
+        ax.plot(flat[:, 0], flat[:, 1], label="node", zorder=3, **style)  # type: ignore[arg-type]
     ax.update_datalim(flat)
     ax.set_aspect("equal", adjustable="datalim")
     ax.autoscale_view()
