@@ -187,8 +187,7 @@ class _Search:
     def _solve(self, weights: Array, steps: int) -> None:
         before = self.now if self.rounds else None
         self.rounds += 1
-        config = SolverConfig(iterations=steps)
-        self.now = self.subgraph.solve(weights, before, config, is_near=steps == _STEPS)
+        self.now = self.subgraph.solve(weights, before, SolverConfig(iterations=steps))
 
     def _graduate(self, allowed: Bool) -> Bool:
         """Return which of the loops allowed, and what is trusted, minimise truncated squares."""

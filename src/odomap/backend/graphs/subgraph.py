@@ -4,7 +4,7 @@ Choosing edges means solving the graph again and again, each time with other wei
 the right poses. Edges of weight 0 are taken out before the equations are laid out: a false loop
 ties far parts of the graph together and may cost more to eliminate than all true ones. The start is
 the better of where the poses were and of the relaxation (`initialization`), which no false loop
-that has lost its weight can hold in a wrong valley; it is tried again when many have.
+that has lost its weight can hold in a wrong valley.
 
 How sure the graph is of the error e = log(Z⁻¹ D) of any edge is the covariance P of its change
 J (δ_j - M δ_i), M = Ad(D⁻¹), J = J_r⁻¹(e). Neighbours in the factor have it from one selected
@@ -68,7 +68,6 @@ class Subgraph:
     def __init__(self, graph: PoseGraph, stop: Callable[[], bool] | None = None) -> None:
         self.graph, self.stop = graph, stop
         self._whole = _problem(graph, np.ones(graph.num_edges), find_components(graph))
-        self._num_relaxed = 0
         self._sure: tuple[SubgraphSolution, BlockCholesky, Marginals] | None = None
 
     def solve(
@@ -76,26 +75,16 @@ class Subgraph:
         weights: Array,
         before: SubgraphSolution | None,
         config: SolverConfig,
-        is_near: bool = False,
     ) -> SubgraphSolution:
-        """Solve with weights (E,), from the better of the last solution and the relaxation.
-
-        Args:
-            weights: (E,) by which edges count, those of 0 left out.
-            before: last solution, if there is one.
-            config: of the descent.
-            is_near: whether little has changed since: while fewer than a tenth of the edges have
-                gone since the last relaxation, it need not be tried again.
-        """
+        """Solve with weights (E,), from the better of the last solution and the relaxation."""
         used = self.graph.without(weights <= 0.0)
         w = weights[weights > 0.0]
         components = find_components(used, through_landmarks=True)
         problem = _problem(used, w, components)
         problem.analyse()
-        starts = [] if before is None else [before.x]
-        if not (starts and is_near and used.num_edges > 0.9 * self._num_relaxed):
-            starts.append(problem.state(*_placed(used, chordal(used, None, w))))
-            self._num_relaxed = used.num_edges
+        starts = [problem.state(*_placed(used, chordal(used, None, w)))]
+        if before is not None:
+            starts.insert(0, before.x)
         start = min(starts, key=problem.cost_of_edges)
         descent = descend(problem, start, config, self.stop)
         equations = used.dim * (used.num_edges + len(used.priors.node))
