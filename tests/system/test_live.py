@@ -60,17 +60,11 @@ class Slow:
 
     def __init__(self, map):
         self.map, self.read, self.written = map, [], []
-        self.go, self.solved = threading.Semaphore(0), threading.Semaphore(0)
+        self.go = threading.Semaphore(0)
 
     def add(self, keyframe):
         self.read.append(keyframe.id)
         return SlowJob(self, keyframe.id)
-
-    def release(self):
-        """Let a job be solved, and see that its worker knows."""
-        self.go.release()
-        assert self.solved.acquire(timeout=5)
-        time.sleep(0.05)
 
 
 class SlowJob:
@@ -78,12 +72,20 @@ class SlowJob:
         self.mapper, self.keyframe_id, self.loops = mapper, keyframe_id, ()
 
     def solve(self):
-        assert self.mapper.go.acquire(timeout=5)
-        self.mapper.solved.release()
+        assert self.mapper.go.acquire(timeout=30)
         return self
 
     def write(self, map):
         self.mapper.written.append(self.keyframe_id)
+
+
+def release(worker):
+    """Let a job be solved, and see that the worker knows."""
+    worker.stages.mapper.go.release()
+    deadline = time.perf_counter() + 30
+    while not worker._lanes[0].is_solved:
+        assert time.perf_counter() < deadline
+        time.sleep(0.001)
 
 
 def make(during=lambda frame: None, mapper=None, **config):
@@ -114,7 +116,7 @@ def test_a_change_is_written_at_the_first_frame_that_finds_it_solved():
     for frame in frames(0, 1):
         worker.advance(frame)
     assert (mapper.read, mapper.written) == ([0], [])
-    mapper.release()
+    release(worker)
     assert mapper.written == []  # never between frames
     worker.advance(Frame(1, 50))
     assert (mapper.read, mapper.written) == ([0, 1], [0])
@@ -131,7 +133,7 @@ def test_a_mapper_that_is_behind_skips_to_the_newest_keyframe():
         worker.advance(frame)
     assert mapper.read == [0]
     assert worker.jobs_skipped == 3  # 1, 2 and 3; 4 waits
-    mapper.release()
+    release(worker)
     worker.advance(Frame(5, 250))
     assert mapper.read == [0, 4]
     assert worker.jobs_skipped == 3  # and now 5 waits
@@ -170,7 +172,7 @@ def test_frames_that_come_too_fast_are_dropped_and_counted(caplog):
         found = [frame.id for frame, _ in worker.run(endless(stop))]
     worker.finish()
     assert found == sorted(set(found))
-    assert worker.frames_dropped > len(found)
+    assert worker.frames_dropped > 0
     assert len(found) + worker.frames_dropped > 60
     assert "is dropped: tracking is slower than the source" in caplog.text
     assert len(caplog.records) == 1
@@ -211,7 +213,7 @@ def test_a_jump_of_the_clock_is_not_waited_for():
     worker = make(queue=3)
     start = time.perf_counter()
     assert len(list(worker.run(recording))) == 3
-    assert time.perf_counter() - start < 1.0
+    assert time.perf_counter() - start < 100.0  # it is a million seconds
     worker.finish()
 
 
@@ -251,7 +253,7 @@ def test_ctrl_c_ends_a_run_though_the_source_waits():
     def source():
         yield from frames(0, 3)
         os.kill(os.getpid(), signal.SIGINT)
-        stop.wait(1.0)  # a camera that has no frame just now
+        stop.wait(0.5)  # a camera that has no frame just now
         yield Frame(9, 450)
 
     worker = make(queue=5)
@@ -317,22 +319,21 @@ def test_observers_are_told_in_order_from_a_thread_of_their_own():
 
 
 def test_a_slow_observer_loses_messages_but_no_frame():
-    worker, told = make(messages=4), []
+    worker, told, is_busy = make(messages=4), [], threading.Event()
 
     def slow(estimate):
         told.append(estimate.frame_id)
-        time.sleep(0.05)
+        assert is_busy.wait(30)
 
     worker.on_estimate.append(slow)
-    start = time.perf_counter()
     for frame in frames(0, 100):
         worker.advance(frame)
-    assert time.perf_counter() - start < 2.0  # told one by one they would take five seconds
-    worker.finish()
     assert worker.stages.map.num_keyframes == 100
+    assert worker.messages_dropped >= 95
+    is_busy.set()
+    worker.finish()
     assert told[-1] == 99
     assert len(told) + worker.messages_dropped == 100
-    assert worker.messages_dropped > 80
 
 
 def test_an_observer_that_raises_is_detached():
