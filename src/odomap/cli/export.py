@@ -1,4 +1,4 @@
-"""`odomap export`: a coloured cloud and a mesh of what a run saw."""
+"""`odomap export`: a coloured cloud and a mesh of what a run saw; landmarks and poses of a map."""
 
 import sys
 from dataclasses import dataclass
@@ -8,20 +8,28 @@ from typing import Annotated
 import tyro
 
 from odomap.cli.progress import Steps
+from odomap.errors import InputError
 
 __all__ = ["Export"]
 
 
 @dataclass(frozen=True)
 class Export:
-    """Make a coloured point cloud and a mesh (PLY) from a run with depth or stereo.
+    """Make a coloured cloud and a mesh of a run with depth or stereo; write parts of a map file.
 
-    They are re-made from the run's keyframes, for which its recording is opened again. Without
-    --cloud and --mesh both are written into the run's folder.
+    Cloud and mesh are re-made from the run's keyframes, for which its recording is opened again.
+    Without options both are written into the run's folder. --points, --trajectory and --graph take
+    what the map holds, and need no recording.
     """
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """The output folder of `odomap run`."""
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|MAP")]
+    """The output folder of `odomap run`, or a map file."""
+    points: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """PLY file for the landmarks of the map."""
+    trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """TUM file for the keyframes of the map."""
+    graph: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """g2o file for the keyframes of the map and the edges between them."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """PLY file for the coloured points."""
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -41,6 +49,43 @@ class Export:
 
     def execute(self) -> int:
         """Make and write them, and say what they are."""
+        of_map = {
+            "--points": (self.points, (".ply",)),
+            "--trajectory": (self.trajectory, (".tum", ".txt", ".gz")),
+            "--graph": (self.graph, (".g2o", ".gz")),
+        }
+        if any(file is not None for file, _ in of_map.values()):
+            self._write_map(of_map)
+            if self.cloud is None and self.mesh is None:
+                return 0
+        elif self.run.is_file():
+            raise InputError(
+                f"{self.run}: say what of the map: --points, --trajectory or --graph FILE "
+                "(a cloud and a mesh are made of a run's folder)"
+            )
+        return self._make_surface()
+
+    def _write_map(self, wanted: dict[str, tuple[Path | None, tuple[str, ...]]]) -> None:
+        from odomap.files.atomic import make_folder
+        from odomap.files.mapexport import write_map_parts
+        from odomap.files.mapfile import load_map
+
+        source = self.run / "map.odomap" if self.run.is_dir() else self.run
+        files = [file for file, _ in wanted.values() if file is not None]
+        for option, (file, endings) in wanted.items():
+            if file is not None and file.suffix.lower() not in endings:
+                raise InputError(f"{option} {file}: give a name that ends in {endings[0]}")
+        if len({file.resolve() for file in [source, *files]}) < 1 + len(files):
+            raise InputError("--points, --trajectory and --graph: give names of their own")
+        if self.run.is_dir() and not source.exists():
+            raise InputError(f"{self.run}: has no map.odomap: give a map file")
+        m = load_map(source)
+        for file in files:
+            make_folder(file.parent)
+        for line in write_map_parts(m, self.points, self.trajectory, self.graph):
+            print(f"{'wrote':<16} {line}")
+
+    def _make_surface(self) -> int:
         from odomap.export import export
 
         with Steps("export", self.quiet) as steps:

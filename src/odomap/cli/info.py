@@ -1,4 +1,4 @@
-"""`odomap info`: what a recording holds."""
+"""`odomap info`: what a recording or a map file holds."""
 
 import json
 from dataclasses import dataclass
@@ -20,20 +20,26 @@ VARIES = 1.5
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a recording holds: frames, sensors, calibration, gaps, ground truth."""
+    """Say what a recording (frames, sensors, calibration, gaps, truth) or a map file holds."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images), a camera ('camera:0'), a
-    world.yaml, or 'sim:room?seed=3&frames=100'."""
+    world.yaml, 'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
     check: bool = False
-    """Read every frame, and say which cannot be used."""
+    """Read every frame, and say which cannot be used; read all of a map file."""
     json: bool = False
     """Print JSON."""
 
     def execute(self) -> int:
         """Print the facts."""
+        if Path(self.data).suffix == ".odomap":
+            from odomap.files.mapdescribe import describe_map, map_lines
+
+            inside = describe_map(self.data, check=self.check)
+            print(json.dumps(inside, indent=2) if self.json else "\n".join(map_lines(inside)))
+            return 0
         from odomap.sources.describe import describe
         from odomap.sources.open import open as open_source
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.files.mapchecks import Numbers
+from odomap.files.mapchecks import Numbers, slots_of
 from odomap.maps.edges import EdgeTable
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.tables import MapTables
@@ -52,9 +52,7 @@ def tables_of(
 ) -> MapTables:
     """Return the tables of a map; what `columns_of` gave, and what `check_tables` let pass."""
     c = dict(columns)
-    order = np.argsort(c["landmarks/id"], kind="stable")
-    rows = np.searchsorted(c["landmarks/id"][order], c["observations/landmark"])
-    c["observations/landmark"] = c["landmarks/slot"][order[rows]].astype(np.int32)
+    c["observations/landmark"] = slots_of(c, c["observations/landmark"]).astype(np.int32)
     edges = EdgeTable(
         c["edges/i"],
         c["edges/j"],
