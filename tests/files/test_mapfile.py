@@ -179,7 +179,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path, spoil, message):
     save_map(tmp_path / "m.odomap", m)
     before = (tmp_path / "m.odomap").read_bytes()
     spoil(m)
-    with pytest.raises(InputError, match=rf"m\.odomap: the map cannot be saved: .*{message}"):
+    with pytest.raises(OutputError, match=rf"m\.odomap: the map cannot be saved: .*{message}"):
         save_map(tmp_path / "m.odomap", m)
     assert [p.name for p in tmp_path.iterdir()] == ["m.odomap"]
     assert (tmp_path / "m.odomap").read_bytes() == before

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import InputError
+from odomap.errors import InputError, OutputError
 from odomap.files.atomic import atomic_binary
 from odomap.files.fields import Fields
 from odomap.files.mapchecks import Numbers, check_tables
@@ -77,9 +77,8 @@ def save_map(
         settings: what it was made with: numbers, texts, lists and mappings, kept as they are.
 
     Raises:
-        InputError: the map cannot be read back: a pose or a measurement is not finite, a payload
-            is of a kind that is not kept.
-        OutputError: the operating system refuses.
+        OutputError: the operating system refuses; or the map could not be read back, since a pose
+            or a measurement is not finite, or a payload is of a kind that is not kept.
 
     Example:
         >>> save_map("map.odomap", Map())  # doctest: +SKIP
@@ -108,10 +107,8 @@ def save_map(
                 "arrays": writer.arrays,
             }
             writer.close(manifest)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{file}: the map cannot be saved: {error}") from error
-    except InputError as error:
-        raise InputError(f"{file}: the map cannot be saved: {error}") from error
+    except (ValueError, TypeError, InputError) as error:
+        raise OutputError(f"{file}: the map cannot be saved: {error}") from error
 
 
 def load_map(path: str | Path, *, limit_mb: float = 4096.0) -> Map:
