@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from odomap.backend.graphs.certificate import Certificate, certify
     from odomap.backend.graphs.chordal import chordal_cost
     from odomap.backend.graphs.covariances import covariances, joint_covariance, relative_covariance
+    from odomap.backend.graphs.gnc import GncConfig
     from odomap.backend.graphs.incremental import IncrementalPoseGraph
     from odomap.backend.graphs.posegraph import PoseGraph, Priors, Sights
     from odomap.backend.graphs.solve import Solution, solve
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from odomap.files.clouds import read_ply, write_ply
     from odomap.files.g2o import read_g2o, write_g2o
     from odomap.files.graphs import read_graph, write_graph
+    from odomap.files.mapfile import MapFile, load_map, save_map
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
     from odomap.geometry.camera import Camera
@@ -82,10 +84,12 @@ __all__ = [
     "ConfigError",
     "Estimate",
     "Frame",
+    "GncConfig",
     "IncrementalPoseGraph",
     "InputError",
     "Loss",
     "Map",
+    "MapFile",
     "MissingExtra",
     "MonocularVO",
     "OdomapError",
@@ -114,6 +118,7 @@ __all__ = [
     "covariances",
     "export",
     "joint_covariance",
+    "load_map",
     "open",
     "preset",
     "read_bal",
@@ -126,6 +131,7 @@ __all__ = [
     "relative_covariance",
     "rpe",
     "run",
+    "save_map",
     "solve",
     "view_covariance",
     "write_bal",
@@ -147,10 +153,12 @@ _HOMES = {
     "ConfigError": "errors",
     "Estimate": "maps.estimate",
     "Frame": "sensors.frame",
+    "GncConfig": "backend.graphs.gnc",
     "IncrementalPoseGraph": "backend.graphs.incremental",
     "InputError": "errors",
     "Loss": "geometry.robust",
     "Map": "maps.map",
+    "MapFile": "files.mapfile",
     "MissingExtra": "errors",
     "MonocularVO": "system.odometry",
     "OdomapError": "errors",
@@ -181,6 +189,7 @@ _HOMES = {
     "covariances": "backend.graphs.covariances",
     "export": "export",
     "joint_covariance": "backend.graphs.covariances",
+    "load_map": "files.mapfile",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
@@ -193,6 +202,7 @@ _HOMES = {
     "relative_covariance": "backend.graphs.covariances",
     "rpe": "evaluation.metrics",
     "run": "run",
+    "save_map": "files.mapfile",
     "solve": "backend.graphs.solve",
     "view_covariance": "backend.adjustment.covariance",
     "write_bal": "files.bal",
