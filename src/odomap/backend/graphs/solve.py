@@ -107,8 +107,8 @@ def solve(
     Args:
         graph: the problem; poses may be unknown (NaN).
         cost: "geodesic", of distances along the group, or "chordal", of SE-Sync, isotropic.
-        initial: where to begin; "auto" takes the better of what is given and chordal; with a loss,
-            chordal without the loops that no other confirms. "gnc" has a start of its own.
+        initial: where to begin; "auto" takes the better of what is given and chordal, judged with a
+            loss by the loops that others confirm (`start`). "gnc" has a start of its own.
         loss: robust loss of loop edges (`PoseGraph.is_loop`) and sights, or its name; default none.
         robust: "gnc" finds false loop edges and leaves them out (`Solution.is_rejected`).
         weights: (E,) by which edges count; 0 leaves one out. Default 1.
