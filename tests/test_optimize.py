@@ -143,10 +143,21 @@ def test_each_part_of_a_graph_is_solved(cli):
     write_g2o("two.g2o", two_parts())
     code, out, _ = cli("optimize", "two.g2o", "--out", "best.toro", "--no-picture")
     assert code == 0
-    assert lines_of(out)["components"].startswith("2 (of 40, 40 poses): solved one by one")
+    assert lines_of(out)["components"].startswith(
+        "2 (of 40, 40 poses): solved one by one, not placed"
+    )
     best = read_graph("best.toro").positions
     np.testing.assert_allclose(best[:40], best[40:], atol=1e-6)
     assert not Path("best.png").exists()
+
+
+def test_parts_that_priors_place_are_placed(cli):
+    graph = two_parts()
+    nodes = np.array([0, graph.num_nodes // 2])
+    information = np.tile(np.eye(graph.dim), (2, 1, 1))
+    write_g2o("two.g2o", graph.with_priors(Priors(nodes, graph.Ts_world_node[nodes], information)))
+    _, out, _ = cli("optimize", "two.g2o")
+    assert lines_of(out)["components"].endswith("each placed in the world")
 
 
 def test_a_picture_alone(cli):

@@ -46,6 +46,7 @@ class OptimizeResult:
         cost: the cost that was minimised.
         certificate: whether the poses are proven to be the best; None if not asked for.
         sizes: nodes of each connected component, the largest first.
+        num_loose: how many of them neither a prior nor a fixed node places in the world.
         skipped: lines of the file that were passed over, by tag.
         seconds: to solve, start included; reading, compiling, proof and pictures are not.
         is_interrupted: whether Ctrl-C ended it.
@@ -56,6 +57,7 @@ class OptimizeResult:
     cost: "Cost"
     certificate: "Certificate | None"
     sizes: tuple[int, ...]
+    num_loose: int
     skipped: Mapping[str, int]
     seconds: float
     is_interrupted: bool
@@ -141,8 +143,9 @@ def optimize(
         is_interrupted = interrupt.is_set()
     kept = solution.graph.without(solution.is_rejected)
     certificate = prove(kept) if certify and not is_interrupted else None
+    parts = _parts(kept)
     return OptimizeResult(
-        solution, cost, certificate, _sizes(kept), file.skipped, seconds, is_interrupted, written
+        solution, cost, certificate, *parts, file.skipped, seconds, is_interrupted, written
     )
 
 
@@ -182,12 +185,13 @@ def _check_lengths(graph: PoseGraph) -> None:
         raise InputError(f"{name} is {length[edge]:.3g} m long: remove it, or leave out robust")
 
 
-def _sizes(graph: PoseGraph) -> tuple[int, ...]:
-    """Return how many nodes each connected component has, the largest first."""
+def _parts(graph: PoseGraph) -> tuple[tuple[int, ...], int]:
+    """Return how many nodes each connected component has, the largest first, and how many float."""
     from odomap.backend.graphs.components import find_components
 
-    label = find_components(graph, through_landmarks=True).label
-    return tuple(sorted(np.bincount(label).tolist(), reverse=True))
+    components = find_components(graph, through_landmarks=True)
+    sizes = sorted(np.bincount(components.label).tolist(), reverse=True)
+    return tuple(sizes), int(components.is_free.sum())
 
 
 def _write(

@@ -127,7 +127,7 @@ def rows(result: "OptimizeResult") -> list[tuple[str, str]]:
     lines = [
         ("graph", f"{graph.group}, {graph.num_nodes} poses, {graph.num_edges} edges{also}"),
         ("loops", f"{loops} edges"),
-        ("components", _parts(result.sizes)),
+        ("components", _parts(result.sizes, result.num_loose)),
         ("start", solution.initial.replace("_", " ")),
         ("cost", f"{solution.cost_before:.8g} → {solution.cost_after:.8g}  ({result.cost})"),
         ("iterations", f"{solution.iterations}: {solution.reason}"),
@@ -154,11 +154,12 @@ def _rejected(result: "OptimizeResult") -> str:
     return f"{len(edges)} of {int(graph.is_loop.sum())} loops{': ' if shown else ''}{listed}"
 
 
-def _parts(sizes: tuple[int, ...]) -> str:
+def _parts(sizes: tuple[int, ...], num_loose: int) -> str:
     if len(sizes) == 1:
         return "1"
     shown = ", ".join(map(str, sizes[:5])) + (", …" if len(sizes) > 5 else "")
-    return f"{len(sizes)} (of {shown} poses): solved one by one, not placed relative to each other"
+    placed = "not placed relative to each other" if num_loose else "each placed in the world"
+    return f"{len(sizes)} (of {shown} poses): solved one by one, {placed}"
 
 
 def _code(result: "OptimizeResult") -> int:
