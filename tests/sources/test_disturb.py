@@ -12,8 +12,14 @@ from odomap.sensors.rig import Rig
 from odomap.sources.disturb import (
     blank,
     blur,
+    cover,
     drop,
+    duplicate,
+    exposure_jumps,
     freeze,
+    kill_right,
+    moving_object,
+    overexpose,
     pierce_depth,
     reverse,
     roughen_depth,
@@ -66,7 +72,10 @@ def same(ours: Frame, theirs: Frame) -> bool:
         return False
     if ours.imu is not None and theirs.imu is not None:
         assert np.array_equal(ours.imu.stamps_ns, theirs.imu.stamps_ns)
-    return all(np.array_equal(a, b) for a, b in zip(ours.images, theirs.images, strict=True))  # type: ignore[arg-type]
+    return all(
+        a is b if a is None or b is None else np.array_equal(a, b)
+        for a, b in zip(ours.images, theirs.images, strict=True)
+    )
 
 
 ALL: dict[str, Callable[[Source], Source]] = {
@@ -74,8 +83,15 @@ ALL: dict[str, Callable[[Source], Source]] = {
     "blur": lambda s: blur(s, [2, 3]),
     "drop": lambda s: drop(s, [2, 3]),
     "freeze": lambda s: freeze(s, [2, 3]),
+    "overexpose": lambda s: overexpose(s, [2, 3]),
+    "exposure_jumps": lambda s: exposure_jumps(s, 2, (1.0, 2.0), cameras=[1]),
+    "cover": lambda s: cover(s, [2, 3]),
+    "moving_object": lambda s: moving_object(s, [2, 3]),
+    "kill_right": lambda s: kill_right(s, 3),
+    "frozen right": lambda s: kill_right(s, 3, "frozen"),
     "pierce_depth": lambda s: pierce_depth(s, [2, 3], share=0.5),
     "roughen_depth": lambda s: roughen_depth(s, [2, 3]),
+    "duplicate": lambda s: duplicate(s, [2, 3]),
     "reverse": reverse,
     "there_and_back": there_and_back,
     "nested": lambda s: there_and_back(drop(blank(drop(freeze(s, [1]), [2]), [3]), [4])),

@@ -1,6 +1,9 @@
 """Disturbances: wrap a source to see what a system does when sensors fail or places recur.
 
     blank, drop, freeze, blur       a covered lens, lost frames, a camera that hangs, fast motion
+    overexpose, exposure_jumps      too much light, an exposure that jumps
+    cover, moving_object            a hand over the lens, a thing that moves through the view
+    duplicate, kill_right           frames delivered twice, a pair whose right camera dies
     pierce_depth, roughen_depth     depth with holes (glass, black cloth, the sun), or noise
     reverse, there_and_back         the same recording played backwards, or forth and back
 
@@ -27,14 +30,23 @@ from numpy.typing import NDArray
 from odomap.errors import InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
+from odomap.sources.disturb_light import exposure_jumps, overexpose
+from odomap.sources.disturb_streams import duplicate, kill_right
+from odomap.sources.disturb_things import cover, moving_object
 from odomap.sources.source import Source
 from odomap.sources.wrappers import Changed, Dropped, Frozen, Replayed, seekable
 
 __all__ = [
     "blank",
     "blur",
+    "cover",
     "drop",
+    "duplicate",
+    "exposure_jumps",
     "freeze",
+    "kill_right",
+    "moving_object",
+    "overexpose",
     "pierce_depth",
     "reverse",
     "roughen_depth",
