@@ -14,75 +14,35 @@ Cost: flow of some 300 points per frame; detection, stereo and one bundle adjust
 Reference: Nistér, Naroditsky, Bergen, "Visual Odometry", CVPR 2004.
 """
 
-from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
-
 from odomap.errors import CalibrationError, ConfigError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
-from odomap.geometry.trajectory import Trajectory
-from odomap.maps.estimate import Estimate
-from odomap.maps.map import Map
-from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config, make_association, preset
-from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.mapping import WindowMapper
-from odomap.system.ranging import DepthRanger, Ranger, StereoRanger
-from odomap.system.rhythms import make_worker
+from odomap.system.path import Path
 from odomap.system.stages import Stages
-from odomap.system.starting import OneViewStart, Start, TwoViewsStart
+from odomap.system.starting import make_start
 from odomap.system.tracking import Tracker
-from odomap.vision.rectifier import Rectifier
+from odomap.system.visual import Result, Sight, VisualSystem
 
 __all__ = ["MonocularVO", "Odometry", "Result", "RgbdVO", "StereoVO", "make_odometry"]
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run leaves.
+class Odometry(VisualSystem):
+    """What the odometries of all cameras have in common: frames against the last keyframe.
 
     Attributes:
-        trajectory: T_world_body of all placed frames as known at the end, with covariances.
-        trajectory_live: the frames that could be placed when they came, as they were emitted.
-        keyframes: the keyframes among the frames, as known at the end.
-        map: keyframes and landmarks.
-        is_metric: whether lengths are metres; if not, their unit is the run's own.
-        T_body_tracked: (4, 4) where on the body that is what the poses are of: the identity, or
-            the mount of a single camera, whose path without a scale cannot carry the lever arm.
-    """
-
-    trajectory: Trajectory
-    trajectory_live: Trajectory
-    keyframes: Trajectory
-    map: Map
-    is_metric: bool = True
-    T_body_tracked: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-
-    def truth(self, truth: Trajectory) -> Trajectory:
-        """Return a ground truth of the body as one of what was tracked."""
-        return Trajectory(truth.stamps_ns, truth.Ts_world_body @ self.T_body_tracked)
-
-
-class Odometry:
-    """What the odometries of all cameras have in common.
-
-    Attributes:
-        map: keyframes and landmarks.
+        map: keyframes and landmarks of the last stretch of the way.
         worker: runs the stages; its lists of observers are told of estimates and keyframes.
     """
 
-    def __init__(self, eye: Eye, ranger: Ranger | None, config: Config, rhythm: str) -> None:
-        self.map = Map()
-        self._is_metric, self._T_body_tracked = ranger is not None, np.eye(4)
+    def _stages(self, sight: Sight, config: Config) -> Stages:
+        eye, ranger = sight.eye, sight.ranger
         association = make_association(config, eye.mask)
         keyframes = Keyframes(self.map, eye, ranger, association, config)
-        start: Start = OneViewStart(keyframes, association, config)
-        if ranger is None:
-            start = TwoViewsStart(self.map, eye, keyframes, association, config)
+        start = make_start(self.map, eye, keyframes, association, config)
         self._tracker = Tracker(self.map, eye, association, keyframes, start, config)
         depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
         mapper = WindowMapper(
@@ -94,36 +54,11 @@ class Odometry:
             config.noise,
             *depth,
         )
-        stages = Stages(self.map, self._tracker, mapper)
-        self.worker = make_worker(rhythm, stages, config.threads)
+        return Stages(self.map, self._tracker, mapper)
 
-    def track(self, frame: Frame) -> Estimate:
-        """Place one frame.
-
-        Args:
-            frame: the next one in time.
-
-        Returns:
-            Where the body is, how sure that is, and why not if it is lost.
-
-        Raises:
-            CalibrationError: images or depth cannot be what the rig says.
-            KeyboardInterrupt: Ctrl-C was pressed meanwhile; the frame is done all the same.
-        """
-        return self.worker.track(frame)
-
-    def finish(self) -> Result:
-        """Return the path as known at the end; tracking may go on afterwards."""
-        self.worker.finish()
-        path = self._tracker.path
-        return Result(
-            path.trajectory(),
-            path.trajectory_live(),
-            path.keyframes(),
-            self.map,
-            self._is_metric,
-            self._T_body_tracked,
-        )
+    @property
+    def _path(self) -> Path:
+        return self._tracker.path
 
 
 class StereoVO(Odometry):
@@ -141,9 +76,7 @@ class StereoVO(Odometry):
 
     def __init__(self, rig: Rig, config: Config | None = None, rhythm: str = "inline") -> None:
         config = preset("stereo") if config is None else config
-        rectifier = Rectifier(rig)
-        ranger = StereoRanger.of(rig, rectifier, config.stereo, config.noise.calibration_px)
-        super().__init__(Eye.of_pair(rig, rectifier), ranger, config, rhythm)
+        super().__init__(Sight.of_pair(rig, config), config, rhythm)
 
 
 class MonocularVO(Odometry):
@@ -175,9 +108,7 @@ class MonocularVO(Odometry):
                 "candidates.follow: false, but a single camera gets its landmarks that way alone: "
                 "set it true, or take the preset mono"
             )
-        super().__init__(Eye.of_camera(camera), None, config, rhythm)
-        if T_body_camera is not None:
-            self._T_body_tracked = np.array(T_body_camera.matrix)
+        super().__init__(Sight.of_camera(camera, T_body_camera), config, rhythm)
 
 
 class RgbdVO(Odometry):
@@ -195,11 +126,7 @@ class RgbdVO(Odometry):
 
     def __init__(self, rig: Rig, config: Config | None = None, rhythm: str = "inline") -> None:
         config = preset("rgbd") if config is None else config
-        if rig.depth is None:
-            raise CalibrationError("RGB-D needs 'depth' in the rig: camera, factor, invalid values")
-        mount = rig.camera(rig.depth.camera)
-        eye = Eye.of_camera(mount.camera, rig.cameras.index(mount), mount.T_body_camera)
-        super().__init__(eye, DepthRanger(eye, config.depth), config, rhythm)
+        super().__init__(Sight.of_depth(rig, config), config, rhythm)
 
 
 def make_odometry(rig: Rig, config: Config, rhythm: str = "inline") -> Odometry:

@@ -29,7 +29,7 @@ from odomap.system.path import Placed
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.vision.bootstrap import BetweenView, TwoViewMotion, two_view_motion
 
-__all__ = ["OneViewStart", "Start", "Started", "TwoViewsStart", "Waiting"]
+__all__ = ["OneViewStart", "Start", "Started", "TwoViewsStart", "Waiting", "make_start"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -332,3 +332,12 @@ class TwoViewsStart:
         )
         T_camera_body = se3_inverse(self._eye.T_body_camera)
         return solve_motion(guess, T_camera_body, UNIT_BASELINE, sightings)
+
+
+def make_start(
+    map: Map, eye: Eye, keyframes: Keyframes, association: Association, config: Config
+) -> Start:
+    """Return the start for what an eye sees: one view where depth is measured, else two."""
+    if keyframes.ranger is not None:
+        return OneViewStart(keyframes, association, config)
+    return TwoViewsStart(map, eye, keyframes, association, config)
