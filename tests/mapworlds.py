@@ -42,6 +42,7 @@ def rich_map(seed=0, keyframes=8):
         m.add_observations(keyframe.id, ids, np.arange(6))
         m.add_observations(keyframe.id, rng.integers(0, ids[-1] + 1, 6), np.arange(6, 12))
         m.count_seen(ids)
+        m.count_expected(np.r_[ids, ids])
         if n:
             m.add_edge(n - 1, n, random_pose(rng), np.eye(6) * n, "odometry")
     m.states.biases[1] = 0.1
@@ -61,6 +62,7 @@ class Walk(MapMachine):
         "add_keyframe",
         "add_landmarks",
         "observe",
+        "expect_and_describe",
         "remove_observations",
         "remove_landmarks",
         "fuse",

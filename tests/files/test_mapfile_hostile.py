@@ -72,6 +72,27 @@ def test_what_was_rewritten_unchanged_is_read(tmp_path, good):
     load_map(path)
 
 
+def test_a_file_of_version_1_is_read_and_held_to_its_version(tmp_path, good):
+    _, manifest, arrays = good
+    first = {name: array for name, array in arrays.items() if name != "landmarks/expected"}
+    older = {**manifest, "odomap_map": 1}
+    older["arrays"] = {name: manifest["arrays"][name] for name in first}
+    m = load_map(rewritten(tmp_path / "m.odomap", older, first))
+    ids = m.landmark_ids
+    assert m.seen(ids).max() > 0
+    assert m.expected(ids).tolist() == m.seen(ids).tolist()
+    with MapFile(tmp_path / "m.odomap") as file:
+        assert file.version == 1
+    save_map(tmp_path / "n.odomap", m)
+    with MapFile(tmp_path / "n.odomap") as file:
+        assert file.version == 2
+    older["arrays"] = manifest["arrays"]
+    path = rewritten(tmp_path / "m.odomap", older, arrays)
+    refused(path, "'landmarks/expected': is no part of a map of version 1")
+    newer = {**manifest, "arrays": {name: manifest["arrays"][name] for name in first}}
+    refused(rewritten(path, newer, first), "landmarks/expected is not declared")
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -206,7 +227,7 @@ def test_a_member_over_another(tmp_path, good):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"odomap_map": 2}, "is of version 2, this odomap reads 1: it was written by a newer"),
+        ({"odomap_map": 3}, "is of version 3, this odomap reads 2: it was written by a newer"),
         ({"odomap_map": 0}, "has no version"),
         ({"odomap_map": True}, "has no version"),
         ({"odomap_map": "1"}, "has no version"),
@@ -316,6 +337,7 @@ NAN, INF = float("nan"), float("inf")
         (with_entry("landmarks/anchor", 1, 10**6), "landmarks/anchor"),
         (with_entry("landmarks/p_anchor", (1, 1), INF), "landmarks/p_anchor"),
         (with_entry("landmarks/seen", 1, -1), "landmarks/seen"),
+        (with_entry("landmarks/expected", 1, -1), "landmarks/expected"),
         (with_entry("landmarks/fused", 0, 0), "landmarks/fused"),
         (with_entry("landmarks/survivor", 0, 1), "landmarks/survivor"),
         (with_entry("observations/keyframe", 0, 0), "observations/keyframe"),
@@ -446,7 +468,9 @@ def test_fuzzed_contents_with_true_checksums(tmp_path, good):
         if len(flat) and rng.random() < 0.8:
             index = rng.integers(0, len(flat), 1 if rng.random() < 0.7 else 5)
             if array.dtype.kind == "f":
-                flat[index] = rng.choice([NAN, INF, -1.0, 0.0, 1e300, 1e-300, 0.5], len(index))
+                wild = rng.choice([NAN, INF, -1.0, 0.0, 1e300, 1e-300, 0.5], len(index))
+                with np.errstate(over="ignore"):
+                    flat[index] = wild.astype(array.dtype)
             else:
                 wild = np.array([WILD[i] for i in rng.integers(0, len(WILD), len(index))])
                 flat[index] = wild.astype(array.dtype)

@@ -58,6 +58,8 @@ class Model:
     obs: dict = field(default_factory=dict)  # (keyframe, landmark) -> keypoint
     heir: dict = field(default_factory=dict)  # fused landmark -> survivor
     seen: dict = field(default_factory=dict)
+    expected: dict = field(default_factory=dict)
+    descriptor: dict = field(default_factory=dict)
 
     def place(self, k):
         if k in self.S:
@@ -126,6 +128,7 @@ class Model:
             del self.points[loser]
             self.heir[loser] = winner
             self.seen[winner] += self.seen[loser]
+            self.expected[winner] += self.expected[loser]
 
     def apply(self, update, born):
         """`born`: keyframes that were there when the snapshot was taken."""
@@ -214,7 +217,8 @@ class MapMachine(RuleBasedStateMachine):
         number = int(rng.integers(1, 6))
         anchors = self.some(rng, [*self.model.S, *self.model.holder], number)
         p = rng.normal(size=(number, 3))
-        ids = self.map.add_landmarks(np.array(anchors), p)
+        look = rng.integers(0, 256, (number, 32), np.uint8)
+        ids = self.map.add_landmarks(np.array(anchors), p, look)
         assert ids.tolist() == list(range(self.landmarks_ever, self.landmarks_ever + number))
         self.landmarks_ever += number
         for x, anchor, point in zip(ids.tolist(), anchors, p):
@@ -224,7 +228,8 @@ class MapMachine(RuleBasedStateMachine):
                     anchor = self.model.holder[anchor][0]
                 point = times(np.linalg.inv(self.model.S[anchor]), world)
             self.model.points[x] = anchor, point
-            self.model.seen[x] = 0
+            self.model.seen[x] = self.model.expected[x] = 0
+        self.model.descriptor |= dict(zip(ids.tolist(), look))
         self.changed()
 
     @rule(seed=SEEDS)
@@ -243,6 +248,22 @@ class MapMachine(RuleBasedStateMachine):
         for x in landmarks.tolist():
             if (x := self.model.resolve(x)) >= 0:
                 self.model.seen[x] += 1
+        self.changed()
+
+    @rule(seed=SEEDS)
+    def expect_and_describe(self, seed):
+        rng = self.rng(seed)
+        landmarks = rng.integers(-1, self.landmarks_ever, 8)
+        self.map.count_expected(landmarks)
+        for x in landmarks.tolist():
+            if (x := self.model.resolve(x)) >= 0:
+                self.model.expected[x] += 1
+        self.changed()
+        look = rng.integers(0, 256, (8, 32), np.uint8)
+        self.map.set_descriptors(landmarks, look)
+        for x, row in zip(landmarks.tolist(), look):
+            if x in self.model.points:
+                self.model.descriptor[x] = row
         self.changed()
 
     @precondition(lambda self: self.model.holder)
@@ -375,6 +396,9 @@ class MapMachine(RuleBasedStateMachine):
         assert set(m.anchors(alive).tolist()) <= set(model.S)
         assert m.anchors(alive).tolist() == [model.points[x][0] for x in alive.tolist()]
         assert m.seen(alive).tolist() == [model.seen[x] for x in alive.tolist()]
+        assert m.expected(alive).tolist() == [model.expected[x] for x in alive.tolist()]
+        look = [model.descriptor[x] for x in alive.tolist()]
+        np.testing.assert_array_equal(m.descriptors(alive), np.reshape(look, (-1, 32)))
 
     @invariant()
     def both_views_tell_the_same(self):
@@ -397,6 +421,46 @@ class MapMachine(RuleBasedStateMachine):
         assert m.count_observers(alive).tolist() == [
             len(model.observers(x)) for x in alive.tolist()
         ]
+
+    @invariant()
+    def what_lies_around_is_found(self):
+        if not self.model.order:
+            return
+        model, m, rng = self.model, self.map, np.random.default_rng(self.step)
+        asked = rng.integers(-1, self.landmarks_ever, 6)
+        known = {model.resolve(x) for x in asked.tolist()} - {-1}
+        counts = {k: sum((k, x) in model.obs for x in known) for k in model.S}
+        ranked = sorted((-n, k) for k, n in counts.items() if n)
+        ids, numbers = m.observing(asked)
+        assert list(zip((-numbers).tolist(), ids.tolist())) == ranked
+        keyframes = self.some(rng, [*model.S, *model.holder], 3)
+        seen = {x for k, x in model.obs if k in keyframes}
+        assert m.landmarks_of(keyframes).tolist() == sorted(seen)
+        mount = random_pose(rng)
+        views = m.views_of(asked, mount)
+        assert views.ids.tolist() == sorted(known)
+        for n, x in enumerate(views.ids.tolist()):
+            at, anchor = model.world(x), model.points[x][0]
+            watchers = model.observers(x) or [anchor]
+            rays = {k: at - times(model.S[k], mount[:3, 3]) for k in watchers}
+            total = sum(ray / np.linalg.norm(ray) for ray in rays.values())
+            reference = rays[anchor if anchor in rays else min(rays)]
+            np.testing.assert_allclose(views.points_world[n], at, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(views.distance[n], np.linalg.norm(reference), rtol=1e-5)
+            if np.linalg.norm(total) > 1e-3:
+                np.testing.assert_allclose(
+                    views.normals[n], total / np.linalg.norm(total), atol=1e-3
+                )
+            np.testing.assert_array_equal(views.descriptors[n], model.descriptor[x])
+            assert views.level[n] == 0
+        here, radius, angle = random_pose(rng), 4.0, 1.5
+        distance = {k: np.linalg.norm(S[:3, 3] - here[:3, 3]) for k, S in model.S.items()}
+        turn = {
+            k: np.arccos(np.clip(0.5 * (np.trace(rigid(S)[:3, :3].T @ here[:3, :3]) - 1), -1, 1))
+            for k, S in model.S.items()
+        }
+        close = [k for k in model.S if distance[k] <= radius and turn[k] <= angle]
+        assert m.near(here, radius, angle).tolist() == sorted(close, key=lambda k: distance[k])
 
 
 TestMapMachine = MapMachine.TestCase

@@ -150,7 +150,8 @@ def _landmarks(c: Columns, next_id: int, budget: int) -> None:
     bad = np.flatnonzero(~np.isfinite(c["landmarks/p_anchor"]).all(axis=1))
     if len(bad):
         raise ValueError(f"landmarks/p_anchor: the place of landmark {ids[bad[0]]} is not finite")
-    _need((c["landmarks/seen"] >= 0).all(), "landmarks/seen: is below 0")
+    for name in ("seen", "expected"):
+        _need((c[f"landmarks/{name}"] >= 0).all(), f"landmarks/{name}: is below 0")
 
 
 def _observations(c: Columns) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 
 from odomap.errors import InputError
 from odomap.files.mapfile import MapFile
-from odomap.files.mapmanifest import VERSION
 from odomap.files.mapschema import PAYLOADS
 from odomap.maps.tree import ALIVE
 from odomap.sensors.rig import Rig
@@ -44,7 +43,7 @@ def describe_map(path: str | Path, *, check: bool = False) -> dict[str, Any]:
         steps = np.linalg.norm(np.diff(places[np.argsort(stamps, kind="stable")], axis=0), axis=1)
         return {
             "file": str(path),
-            "version": VERSION,
+            "version": file.version,
             "odomap": file.odomap,
             "bytes": file.size,
             "checked": check,

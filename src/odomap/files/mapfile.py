@@ -144,6 +144,7 @@ class MapFile:
     Attributes:
         path: the file.
         size: its bytes.
+        version: of the format.
         counts: keyframes, stubs, landmarks, observations, edges, as the manifest says.
         arrays: type and shape of every array by name.
         odomap: version of odomap that wrote it.
@@ -165,6 +166,7 @@ class MapFile:
         try:
             self.path, self.size = self._zip.path, self._zip.size
             manifest = Manifest(self._zip)
+            self.version = manifest.version
             self.arrays = manifest.arrays()
             self.counts = manifest.integers("counts", COUNTED)
             self.edge_kinds = manifest.kinds()
@@ -228,7 +230,9 @@ class MapFile:
         Raises:
             InputError: it is broken, or cannot be true.
         """
-        columns = {name: self.array(name) for name in ARRAYS}
+        columns = {name: self.array(name) for name in ARRAYS if name in self.arrays}
+        if self.version < 2:
+            columns["landmarks/expected"] = columns["landmarks/seen"].copy()
         try:
             budget = FREE_BYTES + self.size
             check_tables(columns, self.numbers, len(self.edge_kinds), budget)

@@ -1,10 +1,10 @@
 """The manifest of a map file: which version, which arrays, and the numbers beside them.
 
-    {"odomap_map": 1, "odomap": "0.5", "counts": {...}, "numbers": {...}, "edge_kinds": [...],
+    {"odomap_map": 2, "odomap": "0.6", "counts": {...}, "numbers": {...}, "edge_kinds": [...],
      "rig": {...} or null, "settings": {...},
      "arrays": {"states/scales": {"dtype": "<f8", "shape": [120], "crc32": 305419896}, ...}}
 
-Every array of version 1 has to be declared, with its own type; lengths that have one name must be
+Every array of the version has to be declared, with its own type; lengths that have one name must be
 one number, and each member must be as large as its declaration takes. All that is known before an
 array is read.
 
@@ -20,7 +20,7 @@ from odomap.files.zipreader import ZipReader
 
 __all__ = ["VERSION", "Manifest"]
 
-VERSION = 1
+VERSION = 2
 MOST_KINDS = 256
 LONGEST_KIND = 64
 LONGEST = 1 << 31
@@ -31,6 +31,7 @@ class Manifest:
 
     Attributes:
         content: all of it, plain JSON.
+        version: of the format.
     """
 
     def __init__(self, file: ZipReader) -> None:
@@ -49,6 +50,7 @@ class Manifest:
                 f"is of version {version}, this odomap reads {VERSION}: it was written by a newer "
                 "odomap, update this one"
             )
+        self.version: int = version
 
     def mapping(self, name: str) -> dict[str, Any]:
         """Return a field that is a mapping."""
@@ -81,7 +83,7 @@ class Manifest:
         declared = self.mapping("arrays")
         members = {name.removesuffix(".npy") for name in self._file.members}
         for name in sorted({*members, *declared} - set(wanted)):
-            raise self._file.error(f"{name[:80]!r}: is no part of a map")
+            raise self._file.error(f"{name[:80]!r}: is no part of a map of version {self.version}")
         lengths: dict[str, int] = {}
         found: dict[str, Declared] = {}
         for name, kind in wanted.items():
@@ -100,7 +102,7 @@ class Manifest:
 
     def _wanted(self) -> dict[str, Array]:
         """Return the arrays that have to be there: those of payloads where one of them is."""
-        wanted = dict(ARRAYS)
+        wanted = {name: array for name, array in ARRAYS.items() if array.since <= self.version}
         for kind, columns in PAYLOADS.items():
             if any(name.startswith(f"{kind}/") for name in self._file.members):
                 wanted |= {f"{kind}/{name}": array for name, array in PAYLOAD_TABLE.items()}

@@ -1,4 +1,4 @@
-"""What a map file of version 1 holds: every array with its type and shape.
+"""What a map file holds: every array with its type and shape.
 
 A shape names its lengths by letters, and a letter means the same number wherever it stands:
 
@@ -7,7 +7,8 @@ A shape names its lengths by letters, and a letter means the same number whereve
 
 Payloads are packed: the rows of all keyframes that have one, one after the other, beside a table
 (keyframe, rows, width, checksum). N counts those keyframes, P their rows, Q their bytes or numbers
-where rows have a width of their own. See docs/formats.md for what each array means.
+where rows have a width of their own. A file of version 1 has no `landmarks/expected`: it is read as
+`landmarks/seen`. See docs/formats.md for what each array means.
 """
 
 from collections.abc import Mapping
@@ -19,10 +20,17 @@ __all__ = ["ARRAYS", "PAYLOADS", "PAYLOAD_TABLE", "Array", "Column", "Declared"]
 
 @dataclass(frozen=True)
 class Array:
-    """Type and shape of an array as it should be; lengths are letters or numbers."""
+    """Type and shape of an array as it should be; lengths are letters or numbers.
+
+    Attributes:
+        kind: type.
+        shape: lengths.
+        since: first version of the format that has it.
+    """
 
     kind: str
     shape: tuple[str | int, ...]
+    since: int = 1
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,7 @@ ARRAYS: Mapping[str, Array] = MappingProxyType(
         "landmarks/p_anchor": Array("<f8", ("M", 3)),
         "landmarks/descriptor": Array("|u1", ("M", 32)),
         "landmarks/seen": Array("<i4", ("M",)),
+        "landmarks/expected": Array("<i4", ("M",), since=2),
         "landmarks/free": Array("<i8", ("S",)),
         "landmarks/fused": Array("<i8", ("F",)),
         "landmarks/survivor": Array("<i8", ("F",)),
@@ -88,7 +97,7 @@ ARRAYS: Mapping[str, Array] = MappingProxyType(
         "edges/kind": Array("<i4", ("E",)),
     }
 )
-"""Arrays that every map file has."""
+"""Arrays that every map file of the newest version has."""
 
 PAYLOAD_TABLE: Mapping[str, Array] = MappingProxyType(
     {

@@ -32,6 +32,7 @@ class Landmarks:
         p_anchor: (M, 3) place in the anchor's body frame and units.
         descriptor: (M, 32) uint8, how it looks.
         seen: (M,) frames it was seen in, as counted by the tracker.
+        expected: (M,) frames it should have been seen in.
     """
 
     def __init__(self) -> None:
@@ -40,6 +41,7 @@ class Landmarks:
         self.p_anchor = np.zeros((0, 3))
         self.descriptor = np.zeros((0, 32), np.uint8)
         self.seen = np.zeros(0, np.int32)
+        self.expected = np.zeros(0, np.int32)
         self._by_anchor = Ragged()
         self._free: list[int] = []
         self._end = 0
@@ -60,9 +62,9 @@ class Landmarks:
         """Return copies of all that decides how the table goes on.
 
         Returns:
-            By name: slot, id, anchor, p_anchor, descriptor, seen of the (M,) landmarks in order of
-            their slots; free, the (S,) slots to be used again, the last first; fused and survivor,
-            the (F,) ids that mean another landmark, and its id.
+            By name: slot, id, anchor, p_anchor, descriptor, seen, expected of the (M,) landmarks
+            in order of their slots; free, the (S,) slots to be used again, the last first; fused
+            and survivor, the (F,) ids that mean another landmark, and its id.
         """
         slots = self.all_slots()
         fused = self._first + np.flatnonzero(self._entry[: self._next - self._first] <= -2)
@@ -74,6 +76,7 @@ class Landmarks:
             "p_anchor": self.p_anchor[slots],
             "descriptor": self.descriptor[slots],
             "seen": self.seen[slots],
+            "expected": self.expected[slots],
             "free": np.asarray(self._free, np.int64),
             "fused": fused[heirs >= 0],
             "survivor": self.ids[heirs[heirs >= 0]],
@@ -89,8 +92,10 @@ class Landmarks:
         self.p_anchor = grown(self.p_anchor, self._end)
         self.descriptor = grown(self.descriptor, self._end)
         self.seen = grown(self.seen, self._end)
+        self.expected = grown(self.expected, self._end)
         self.ids[slots], self.anchor[slots] = ids, columns["anchor"]
         self.p_anchor[slots], self.seen[slots] = columns["p_anchor"], columns["seen"]
+        self.expected[slots] = columns["expected"]
         self.descriptor[slots] = columns["descriptor"]
         self._by_anchor.append(columns["anchor"].astype(np.int64), slots.astype(np.int32))
         oldest = (int(known.min(initial=next_id)) for known in (ids, columns["fused"]))
@@ -143,6 +148,7 @@ class Landmarks:
         self.p_anchor[slots] = p_anchor
         self.descriptor[slots] = 0 if descriptors is None else descriptors
         self.seen[slots] = 0
+        self.expected[slots] = 0
         self._by_anchor.append(anchors, slots.astype(np.int32))
         return ids
 
@@ -166,6 +172,7 @@ class Landmarks:
     def forward(self, gone: NDArray[np.int64], survivors: NDArray[np.int64]) -> None:
         """Remove the landmarks in N distinct slots; their ids follow those in N other slots."""
         np.add.at(self.seen, survivors, self.seen[gone])
+        np.add.at(self.expected, survivors, self.expected[gone])
         self._entry[self.ids[gone] - self._first] = -2 - self.ids[survivors]
         self._vacate(gone)
 
@@ -211,4 +218,5 @@ class Landmarks:
         self.p_anchor = grown(self.p_anchor, self._end)
         self.descriptor = grown(self.descriptor, self._end)
         self.seen = grown(self.seen, self._end)
+        self.expected = grown(self.expected, self._end)
         return np.concatenate([np.asarray(reused, np.int64), fresh])

@@ -21,20 +21,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
 from odomap.maps.columns import distinct, members
-from odomap.maps.sightings import Sightings
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
+from odomap.maps.surroundings import Surroundings
 from odomap.maps.tables import MapTables
 from odomap.maps.tree import ALIVE
 
 __all__ = ["Map"]
 
 
-class Map(Sightings):
+class Map(Surroundings):
     """What is remembered of one connected part of the world.
 
-    Keyframes and their poses come from `Skeleton`, landmarks and observations from `Sightings`;
-    here are the operations on all of them: forgetting and solving.
+    Keyframes and their poses come from `Skeleton`, landmarks and observations from `Sightings`,
+    what lies around a place from `Surroundings`; here are the operations on all of them:
+    forgetting, solving and laying open.
     """
 
     def dump(self) -> MapTables:

@@ -23,7 +23,7 @@ __all__ = ["Sightings"]
 
 
 class Sightings(Skeleton):
-    """Landmarks and observations on top of the keyframes; `Map` adds forgetting and solving."""
+    """Landmarks and observations on top of the keyframes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,6 +91,18 @@ class Sightings(Skeleton):
         with self.lock:
             return self._landmarks.descriptor[self._living_slots(landmark_ids)]
 
+    def set_descriptors(self, landmark_ids: ArrayLike, descriptors: NDArray[np.uint8]) -> None:
+        """Write the (N, 32) descriptors of (N,) landmarks; those gone or fused are passed over."""
+        with self.lock:
+            ids = self._ids(landmark_ids)
+            if descriptors.shape != (len(ids), 32) or descriptors.dtype != np.uint8:
+                what = f"{descriptors.dtype} {descriptors.shape}"
+                raise ValueError(f"{len(ids)} landmarks need uint8 ({len(ids)}, 32), not {what}")
+            slots = self._landmarks.slots(ids)
+            itself = (slots >= 0) & (self._landmarks.ids[slots] == ids)
+            self._landmarks.descriptor[slots[itself]] = descriptors[itself]
+            self.version += 1
+
     def remove_landmarks(self, landmark_ids: ArrayLike) -> None:
         """Remove landmarks and their observations; those already gone are passed over."""
         with self.lock:
@@ -154,6 +166,18 @@ class Sightings(Skeleton):
         """Return in how many frames (N,) living landmarks were seen."""
         with self.lock:
             return self._landmarks.seen[self._living_slots(landmark_ids)].astype(np.int64)
+
+    def count_expected(self, landmark_ids: ArrayLike) -> None:
+        """Count one more frame in which landmarks should have been seen; passes over those gone."""
+        with self.lock:
+            slots = self._landmarks.slots(self._ids(landmark_ids))
+            np.add.at(self._landmarks.expected, slots[slots >= 0], 1)
+            self.version += 1
+
+    def expected(self, landmark_ids: ArrayLike) -> NDArray[np.int64]:
+        """Return in how many frames (N,) living landmarks should have been seen."""
+        with self.lock:
+            return self._landmarks.expected[self._living_slots(landmark_ids)].astype(np.int64)
 
     def add_observations(
         self, keyframe_id: int, landmark_ids: ArrayLike, keypoints: ArrayLike
