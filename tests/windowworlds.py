@@ -178,3 +178,11 @@ def with_duplicates(window, rows, from_keyframe, off=0.005, seed=0):
         obs_landmark=obs_landmark,
         num_observers=np.bincount(obs_landmark, minlength=len(window.points_world) + len(rows)),
     )
+
+
+def with_features(window, k, **columns):
+    """Return the window with some columns of keyframe row k's features replaced."""
+    keyframes = list(window.keyframes)
+    features = replace(keyframes[k].features, **columns)
+    keyframes[k] = replace(keyframes[k], features=features)
+    return replace(window, keyframes=tuple(keyframes))
