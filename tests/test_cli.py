@@ -271,9 +271,8 @@ def test_run_writes_everything_and_says_where(cli, recording, tmp_path):
     code, out, err = cli("run", recording, "--out", tmp_path / "a")
     assert code == 0, err
     names = {path.name for path in (tmp_path / "a").iterdir()}
-    wanted = {"trajectory.tum", "trajectory_live.tum", "metrics.json", "config.yaml", "report.html"}
-    assert wanted <= names
-    assert not [name for name in names if name.endswith(".part")]
+    paths = {"trajectory.tum", "trajectory_live.tum", "keyframes.tum"}
+    assert names == paths | {"map.odomap", "config.yaml", "metrics.json", "report.html"}
     assert "ATE RMSE" in out
     assert str(tmp_path / "a" / "report.html") in out
     m = metrics(tmp_path / "a")

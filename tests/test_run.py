@@ -145,7 +145,7 @@ def test_lockstep_is_the_default_and_writes_the_bytes_of_inline(result, tmp_path
     assert "\nrhythm: lockstep\n" in (result.out / "config.yaml").read_text()
     inline = run(WORLD, tmp_path, rhythm="inline")
     assert inline.metrics["rhythm"] == "inline"
-    for name in ("trajectory.tum", "trajectory_live.tum", "keyframes.tum"):
+    for name in ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap"):
         assert (inline.out / name).read_bytes() == (result.out / name).read_bytes()
     for name in ("frames_dropped", "jobs_skipped", "messages_dropped"):
         assert inline.metrics[name] == result.metrics[name] == 0

@@ -1,18 +1,21 @@
 """The logbook of a run: what is kept of each frame, and the numbers made from it.
 
 A run must not grow with its length by more than a few hundred bytes per frame, so images and tracks
-are dropped at once, but for a few frames sampled evenly for the report. The clock is read here and
-in the stages for their timing, and never decides anything.
+are dropped at once, but for a few frames sampled evenly for the report. How large the map is is
+noted with every frame, how much memory is held with every tenth. The clock is read here and in the
+stages for their timing, and never decides anything.
 """
 
 import dataclasses
+import os
 import platform
 import sys
 import time
+from array import array
 from collections import Counter
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,13 +24,20 @@ from odomap.sensors.frame import Frame
 from odomap.sources.source import Skipped, Source
 from odomap.version import __version__
 
-__all__ = ["Logbook", "peak_memory_mb", "versions"]
+if TYPE_CHECKING:
+    from odomap.maps.map import Map
+    from odomap.views.record import Growth
+
+__all__ = ["Logbook", "memory_mb", "peak_memory_mb", "versions"]
 
 SAMPLES = 6
 """Frames kept with their image and tracks for the report."""
 
 SKIPPED_LISTED = 50
 """Skipped measurements that metrics.json lists; all are counted."""
+
+MEMORY_EVERY = 10
+"""Frames after which the memory held is looked at again."""
 
 GAP_S = 1.0
 """A gap between two frames that is worth a warning, seconds."""
@@ -42,12 +52,16 @@ class Logbook:
     Attributes:
         estimates: one per frame, without tracks.
         samples: a few (frame, estimate with tracks) spread over the run.
+        map: whose size is noted with every frame; None notes none.
     """
 
     def __init__(self, total: int) -> None:
         self.estimates: list[Estimate] = []
         self.samples: list[tuple[Frame, Estimate]] = []
+        self.map: Map | None = None
         self._track_ms: list[float] = []
+        self._keyframes, self._landmarks = array("q"), array("q")
+        self._memory_mb = array("d")
         self._wanted = {round(k) for k in np.linspace(0, max(total - 1, 0), SAMPLES)}
         self._cpu_start = time.process_time()
 
@@ -55,6 +69,11 @@ class Logbook:
         """Note one tracked frame and how long it took."""
         if len(self.estimates) in self._wanted:
             self.samples.append((frame, estimate))
+        if len(self.estimates) % MEMORY_EVERY == 0:
+            self._memory_mb.append(memory_mb())
+        if self.map is not None:
+            self._keyframes.append(self.map.num_keyframes)
+            self._landmarks.append(self.map.num_landmarks)
         self.estimates.append(dataclasses.replace(estimate, tracks=None))
         self._track_ms.append(1000.0 * seconds)
 
@@ -72,6 +91,17 @@ class Logbook:
     def count(self, status: Status) -> int:
         """Count the frames of a status."""
         return sum(estimate.status == status for estimate in self.estimates)
+
+    def growth(self) -> "Growth":
+        """Return how large the map and the memory were, frame by frame."""
+        from odomap.views.record import Growth
+
+        return Growth(
+            keyframes=np.array(self._keyframes, np.int64),
+            landmarks=np.array(self._landmarks, np.int64),
+            memory_frames=MEMORY_EVERY * np.arange(len(self._memory_mb)),
+            memory_mb=np.array(self._memory_mb, np.float64),
+        )
 
     @property
     def placed(self) -> int:
@@ -134,7 +164,13 @@ class Logbook:
             "duration_s": self.duration_s(),
             "cpu_s": time.process_time() - self._cpu_start,
             "peak_memory_mb": peak_memory_mb(),
+            "memory_mb": self._memory(),
         }
+
+    def _memory(self) -> dict[str, float]:
+        """Return the memory held at the first frame and now, and the most that was noted."""
+        noted = [*self._memory_mb, memory_mb()]
+        return {"start": noted[0], "end": noted[-1], "peak": max(noted)}
 
 
 def spread(values: list[float]) -> dict[str, float]:
@@ -155,6 +191,16 @@ def skipped_numbers(source: Source) -> dict[str, Any]:
         "skipped": len(skipped),
         "skipped_measurements": [dataclasses.asdict(item) for item in skipped[:SKIPPED_LISTED]],
     }
+
+
+def memory_mb() -> float:
+    """Return the memory this process holds now, megabytes; where nobody says, the most it held."""
+    try:
+        with open("/proc/self/statm", "rb") as statm:
+            pages = int(statm.read().split()[1])
+    except OSError:
+        return peak_memory_mb()
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def peak_memory_mb() -> float:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from odomap.errors import OutputError
 from odomap.files.atomic import make_folder, write_text
+from odomap.files.mapfile import save_map
 from odomap.files.trajectories import write_tum
 from odomap.logbook import Logbook
 from odomap.maps.estimate import Estimate, Status
@@ -46,6 +47,8 @@ REPORTED = (
     "cpu_s",
     "compile_s",
     "peak_memory_mb",
+    "memory_mb",
+    "map_bytes",
 )
 """Metrics that the report shows."""
 
@@ -109,7 +112,8 @@ class Outputs:
         """
         self._close_live()
         failures: list[OutputError] = []
-        report = self._report(source, result, logbook, metrics, warnings)
+        metrics["mapping"] = counts_of(result)
+        metrics["map_bytes"] = None  # until the map is there
         jobs: list[tuple[str, Callable[[], object]]] = [
             ("trajectory.tum", lambda: write_tum(self._at("trajectory.tum"), result.trajectory)),
             (
@@ -117,9 +121,15 @@ class Outputs:
                 lambda: write_tum(self._at("trajectory_live.tum"), result.trajectory_live),
             ),
             ("keyframes.tum", lambda: write_tum(self._at("keyframes.tum"), result.keyframes)),
+            ("map.odomap", lambda: self._write_map(source, result, metrics)),
             ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
             ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
-            ("report.html", lambda: self._write_report(report)),
+            (
+                "report.html",
+                lambda: self._write_report(
+                    self._report(source, result, logbook, metrics, warnings)
+                ),
+            ),
         ]
         for name, job in jobs:
             try:
@@ -136,6 +146,11 @@ class Outputs:
     def _at(self, name: str) -> Path:
         return self.folder / name
 
+    def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
+        file = self._at("map.odomap")
+        save_map(file, result.map, source.rig)
+        metrics["map_bytes"] = file.stat().st_size
+
     def _report(
         self,
         source: "Source",
@@ -148,6 +163,7 @@ class Outputs:
         import numpy as np
 
         from odomap.geometry.pose import Sim3
+        from odomap.views.covisibility import MapView
         from odomap.views.record import Report, Sample, Scale
 
         # A path without a scale is drawn at that of the truth, where there is one.
@@ -178,6 +194,9 @@ class Outputs:
             scale="metric" if result.is_metric else fitted,
             skipped=[(item.stamp_ns, item.file, item.reason) for item in source.skipped],
             points=scale * result.map.points_world(result.map.landmark_ids),
+            map=MapView.of(result.map, scale),
+            growth=logbook.growth(),
+            mapping=metrics["mapping"] or {},
         )
 
     def _write_report(self, report: "Report") -> None:
@@ -203,6 +222,12 @@ class Outputs:
             self._part.unlink(missing_ok=True)
         except OSError:
             return  # nothing more can be done with it, and the final path does not need it
+
+
+def counts_of(result: "Result") -> dict[str, int] | None:
+    """Return what local mapping made and dropped, by name; None where it does not count."""
+    counts: Mapping[str, int] | None = getattr(result, "mapping", None)
+    return {name: int(number) for name, number in counts.items()} if counts else None
 
 
 def _row(estimate: Estimate) -> str:

@@ -11,7 +11,7 @@ import html
 from collections.abc import Iterable, Sequence
 from importlib import resources
 
-__all__ = ["details", "image", "page", "section", "table", "text"]
+__all__ = ["details", "image", "page", "section", "swatch", "table", "text"]
 
 
 def text(value: object) -> str:
@@ -36,6 +36,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
     top = f"<thead><tr>{cells('th', head)}</tr></thead>" if head else ""
     body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return f'<div class="scroll"><table>{top}<tbody>\n{body}\n</tbody></table></div>'
+
+
+def swatch(colour: str | None) -> str:
+    """Make a small square of a colour; an empty one of the same size for None."""
+    return f'<i class="swatch" style="background:{text(colour or "none")}"></i>'
 
 
 def details(summary: str, body: str) -> str:

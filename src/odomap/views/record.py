@@ -10,7 +10,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,19 @@ from numpy.typing import NDArray
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.estimate import Estimate, Status
 
-__all__ = ["LostRun", "Report", "Sample", "Verdict", "environment", "lost_runs", "verdict"]
+if TYPE_CHECKING:
+    from odomap.views.covisibility import MapView
+
+__all__ = [
+    "Growth",
+    "LostRun",
+    "Report",
+    "Sample",
+    "Verdict",
+    "environment",
+    "lost_runs",
+    "verdict",
+]
 
 Level = Literal["good", "warn", "bad"]
 Scale = Literal["metric", "fitted", "free"]
@@ -37,6 +49,23 @@ class Sample:
 
     image: NDArray[np.uint8]
     estimate: Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """How large a run was, frame by frame.
+
+    Attributes:
+        keyframes: (N,) keyframes in the map after each frame; empty where nobody counted.
+        landmarks: (N,) landmarks in the map after each frame; empty likewise.
+        memory_frames: (S,) indices of the frames at which memory was looked at.
+        memory_mb: (S,) memory held then, megabytes.
+    """
+
+    keyframes: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    memory_frames: NDArray[np.int64]
+    memory_mb: NDArray[np.float64]
 
 
 def environment() -> dict[str, str]:
@@ -75,6 +104,9 @@ class Report:
             metres by the truth, or such units as they are.
         points: (M, 3) landmarks in the world, metres, or None.
         environment: versions and machine.
+        map: what the map holds at the end, to be drawn; None for none.
+        growth: how the map and the memory grew, or None.
+        mapping: what local mapping made and dropped, by name.
     """
 
     title: str
@@ -94,6 +126,9 @@ class Report:
     scale: Scale = "metric"
     points: NDArray[np.float64] | None = None
     environment: Mapping[str, str] = field(default_factory=environment)
+    map: "MapView | None" = None
+    growth: Growth | None = None
+    mapping: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def has_path(self) -> bool:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from odomap.files.atomic import write_text
 from odomap.maps.estimate import Estimate
-from odomap.views.page import details, image, page, section, table, text
+from odomap.views.mapsection import map_section
+from odomap.views.page import details, image, page, section, swatch, table, text
 from odomap.views.record import Report, Sample, lost_runs, significant, verdict
 from odomap.views.words import cards, flat, value_text
 
@@ -54,6 +55,7 @@ def render_report(report: Report) -> str:
     """Render a report as the text of one HTML page."""
     parts = [
         ("path", "Path", _path(report)),
+        ("map", "Map", map_section(report)),
         ("error", "Error over time", _error(report)),
         ("features", "Tracked features", _features(report)),
         ("timing", "Timing", _timing(report)),
@@ -186,7 +188,7 @@ def _features(report: Report) -> str:
 
 def _timing(report: Report) -> str:
     from odomap.views.plots import figure_svg, timing_figure
-    from odomap.views.timelines import stage_times
+    from odomap.views.timelines import stage_colours, stage_times
 
     stages = stage_times(report.estimates)
     if not stages:
@@ -194,13 +196,23 @@ def _timing(report: Report) -> str:
     svg = figure_svg(timing_figure(report.estimates), "Milliseconds of each stage, per frame")
     total = np.sum(list(stages.values()), axis=0)
     whole = max(float(total.sum()), 1e-12)
+    colours = stage_colours(stages)
     rows = []
     for name, ms in [*stages.items(), ("all stages", total)]:
-        figures = (np.median(ms), np.percentile(ms, 95), ms.max())
+        ran = ms if name not in stages else ms[[name in e.timing for e in report.estimates]]
+        figures = (np.median(ran), np.percentile(ran, 95), ran.max())
         numbers = [significant(float(v), 3) if v else "0" for v in figures]
-        rows.append([text(name), *numbers, f"{100 * float(ms.sum()) / whole:.0f} %"])
-    head = ["Stage", "median ms", "p95 ms", "max ms", "share"]
-    return f"<figure>{svg}</figure>{table(head, rows, numbers=[1, 2, 3, 4])}"
+        share = f"{100 * float(ms.sum()) / whole:.0f} %"
+        rows.append([swatch(colours.get(name)) + text(name), f"{len(ran):,}", *numbers, share])
+    head = ["Stage", "frames", "median ms", "p95 ms", "max ms", "share"]
+    caption = (
+        "What the tracker's thread did with each frame. The figures of a stage are those of the "
+        "frames in which it ran; its share is that of all time."
+    )
+    return (
+        f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
+        f"{table(head, rows, numbers=[1, 2, 3, 4, 5])}"
+    )
 
 
 def _frames(report: Report) -> str:

@@ -41,9 +41,9 @@ PALETTE = {
     "stage1": "#0173b3",
     "stage2": "#56b4e9",
     "stage3": "#019f74",
-    "stage4": "#f0e442",
+    "stage4": "#cc79a7",
     "stage5": "#e6a001",
-    "stage6": "#cc79a7",
+    "stage6": "#d9cd3a",
     "stage7": "#9aa1ab",
 }
 """Names are CSS variables of the report; all values differ, so that each finds its variable."""

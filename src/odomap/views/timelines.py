@@ -4,6 +4,7 @@ With thousands of frames, columns of neighbouring frames are merged: the worst o
 drawn for inliers (a dip must not vanish), the mean and the maximum for times.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,10 +17,12 @@ from odomap.views.record import lost_runs
 from odomap.views.scene import thin
 from odomap.views.style import PALETTE, STAGES, dress, legend, new_figure, plain
 
-__all__ = ["inlier_figure", "stage_times", "timing_figure"]
+__all__ = ["columns", "inlier_figure", "seconds", "stage_colours", "stage_times", "timing_figure"]
 
 COLUMNS = 500
 RUG = 400
+MOST_IN_A_ROW = 5
+"""Entries of a legend in a row beside the title."""
 
 
 def inlier_figure(estimates: Sequence[Estimate]) -> Figure:
@@ -28,9 +31,9 @@ def inlier_figure(estimates: Sequence[Estimate]) -> Figure:
     ax = dress(figure.subplots(), "Inliers per frame", "time [s]")
     if not estimates:
         return _nothing(figure, ax)
-    t = _times(estimates)
+    t = seconds(estimates)
     counts = np.array([e.num_inliers for e in estimates], np.float64)
-    starts = _columns(len(t))
+    starts = columns(len(t))
     worst = np.minimum.reduceat(counts, starts)
     ax.fill_between(t[starts], worst, color=PALETTE["band"], lw=0, step="post")
     ax.plot(t[starts], worst, color=PALETTE["estimate"], lw=1.2, drawstyle="steps-post",
@@ -66,24 +69,32 @@ def _rug(ax: Axes, t: NDArray[np.float64], y: float, label: str, mark: str, colo
 
 
 def stage_times(estimates: Sequence[Estimate]) -> dict[str, NDArray[np.float64]]:
-    """Return milliseconds per frame of each stage (N,), in the order stages first appear.
+    """Return milliseconds per frame of each stage (N,), those of the most frames first.
 
-    Frames without a stage count as 0; a stage named "total" is left out.
+    Stages of equally many frames keep the order in which they first appear. Frames without a stage
+    count as 0; a stage named "total" is left out.
     """
-    names = dict.fromkeys(name for e in estimates for name in e.timing if name != "total")
+    count = Counter(name for e in estimates for name in e.timing if name != "total")
+    names = sorted(count, key=lambda name: -count[name])
     rows = {n: np.array([e.timing.get(n, 0.0) for e in estimates], np.float64) for n in names}
     return {name: np.where(np.isfinite(ms), ms, 0.0) for name, ms in rows.items()}
 
 
+def stage_colours(stages: dict[str, NDArray[np.float64]]) -> dict[str, str]:
+    """Return the colour in which each stage is drawn; those summed as "other" share one."""
+    few = dict(zip(_few(stages, len(STAGES)), STAGES))
+    return {name: few.get(name, STAGES[-1]) for name in stages}
+
+
 def timing_figure(estimates: Sequence[Estimate]) -> Figure:
     """Draw the time of each stage, stacked, over the frames; a line marks the camera's period."""
-    figure = new_figure(9.6, 3.0)
+    figure = new_figure(9.6, 3.2)
     ax = dress(figure.subplots(), "Time per frame [ms]", "time [s]")
     stages = _few(stage_times(estimates), len(STAGES))
     if not stages:
         return _nothing(figure, ax)
-    t = _times(estimates)
-    starts = _columns(len(t))
+    t = seconds(estimates)
+    starts = columns(len(t))
     sizes = np.diff(np.r_[starts, len(t)])
     means = [np.add.reduceat(ms, starts) / sizes for ms in stages.values()]
     edges = np.r_[t[starts], t[-1] + (t[-1] - t[0]) / max(len(t) - 1, 1)]
@@ -97,7 +108,10 @@ def timing_figure(estimates: Sequence[Estimate]) -> Figure:
     if len(starts) < len(t):
         ax.plot(t[starts], worst, color=PALETTE["muted"], lw=0.8, label="slowest frame")
     _limits(ax, total, t)
-    legend(ax)
+    # In two rows where there are many, of which the upper one needs a margin.
+    rows = 1 if len(ax.get_legend_handles_labels()[1]) <= MOST_IN_A_ROW else 2
+    figure.subplots_adjust(top=1.0 - (0.14 + 0.18 * rows) / figure.get_figheight())
+    legend(ax, ncols=MOST_IN_A_ROW)
     return figure
 
 
@@ -129,13 +143,13 @@ def _few(stages: dict[str, NDArray[np.float64]], limit: int) -> dict[str, NDArra
     return few
 
 
-def _times(estimates: Sequence[Estimate]) -> NDArray[np.float64]:
+def seconds(estimates: Sequence[Estimate]) -> NDArray[np.float64]:
+    """Return the time of each frame after the first, seconds."""
     stamps = np.array([e.stamp_ns for e in estimates], np.int64)
-    seconds: NDArray[np.float64] = (stamps - stamps[0]) * 1e-9
-    return seconds
+    return np.asarray((stamps - stamps[:1]) * 1e-9, np.float64)
 
 
-def _columns(n: int) -> NDArray[np.intp]:
+def columns(n: int) -> NDArray[np.intp]:
     """Return where each column of merged frames starts."""
     return np.unique(np.linspace(0, n, min(n, COLUMNS), endpoint=False).astype(np.intp))
 

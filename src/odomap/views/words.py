@@ -15,6 +15,7 @@ UNITS = {
     "_hz": "Hz",
     "_ms": "ms",
     "_mb": "MB",
+    "_bytes": "B",
     "_m": "m",
     "_s": "s",
     "ms_per_frame": "ms",
@@ -69,6 +70,8 @@ def _with_unit(value: object, unit: str) -> str:
         return "–" if value is None else str(value)
     if not math.isfinite(value):
         return "–"
+    if unit == "B":
+        return f"{significant(value / 1e6, 3)} MB"
     if isinstance(value, int):
         return f"{value:,} {unit}".strip()
     if unit == "m":

@@ -1,0 +1,155 @@
+"""The map seen from above: landmarks, keyframes and what joins them, the path and the truth.
+
+A plan shows the two axes along which the path extends most, so it is seen along the third. The
+picture reaches as far as nearly all landmarks do, but not to the few badly triangulated ones that
+would press the rest into a dot. Thousands of dots and lines are one drawing element each kind,
+which keeps a page small.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from odomap.views.covisibility import MapView
+from odomap.views.scene import AXES, Scene, gaps_as_nan, thin
+from odomap.views.style import PALETTE, dress, legend, new_figure
+
+__all__ = ["plan_axes", "plan_figure"]
+
+LANDMARKS = 4000
+KEYFRAMES = 1000
+PATH_POINTS = 900
+REACH = 10.0
+"""Landmarks farther from the path's middle than this many of its radii are out of the picture."""
+
+USUAL = 1.5
+"""Percent of the landmarks at either end of an axis that the picture need not reach."""
+
+ALPHAS = (0.12, 0.22, 0.36, 0.55)
+"""How strongly a pair of keyframes is joined: each step is twice as many landmarks shared."""
+
+
+def plan_axes(place: Scene) -> tuple[int, int]:
+    """Return the two axes along which a path extends most, the one drawn to the right first.
+
+    Of axes that extend alike the horizontal ones are taken.
+    """
+    extents = np.ptp(place.positions, axis=0)
+    least = min(range(3), key=lambda k: (round(float(extents[k]), 3), k != place.up_axis))
+    a, b = (k for k in range(3) if k != least)
+    return (b, a) if a == place.up_axis else (a, b)
+
+
+def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
+    """Draw a map from above.
+
+    Args:
+        place: the path, and its truth.
+        view: the map, in the estimate's world.
+        unit: what lengths are in; "units" where a path has no scale.
+    """
+    figure = new_figure(9.6, 5.6)
+    axes = plan_axes(place)
+    names = [f"{AXES[k]} [{unit}]" for k in axes]
+    ax = dress(figure.subplots(), "The map from above", *names)
+    keyframes = _moved(place, view.keyframes)[:, axes]
+    landmarks = _moved(place, view.landmarks)
+    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
+    dots = landmarks[thin(len(landmarks), LANDMARKS)][:, axes]
+    _dots(ax, dots, 1.7, color=PALETTE["muted"], alpha=0.5, zorder=1)
+    _joins(ax, keyframes, view)
+    _lines(ax, place, axes)
+    shown = keyframes[thin(len(keyframes), KEYFRAMES)]
+    _dots(ax, shown, 3.6, color=PALETTE["keyframe"], zorder=5)
+    for index, marker, label in ((0, "o", "start"), (-1, "s", "end")):
+        at = place.positions[index, list(axes)]
+        style = {"ms": 6, "mfc": "none", "mec": PALETTE["ink"], "ls": "", "zorder": 6}
+        ax.plot(*at, marker, label=label, **style)  # type: ignore[arg-type]
+    _window(ax, place, landmarks, axes)
+    if place.up_sign < 0 and axes[1] == place.up_axis:
+        ax.invert_yaxis()
+    drawn = len(dots) > 0, len(view.pairs) > 0, len(shown) > 0
+    legend(ax, handles=[*_key(view, *drawn), *ax.get_legend_handles_labels()[0]])
+    return figure
+
+
+def _key(view: MapView, landmarks: bool, pairs: bool, keyframes: bool) -> list[Line2D]:
+    """Return what stands in the legend for strokes, which are drawn without a name."""
+    dot = {"marker": "o", "ls": ""}
+    join = f"{view.least} or more landmarks shared"
+    entries: list[tuple[bool, str, dict[str, Any]]] = [
+        (landmarks, "landmark", {**dot, "ms": 2.5, "color": PALETTE["muted"]}),
+        (keyframes, "keyframe", {**dot, "ms": 4.0, "color": PALETTE["keyframe"]}),
+        (pairs, join, {"lw": 1.2, "color": PALETTE["good"], "alpha": ALPHAS[-1]}),
+    ]
+    return [Line2D([], [], label=label, **style) for is_drawn, label, style in entries if is_drawn]
+
+
+def _moved(place: Scene, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    T = place.T_drawn_world
+    moved: NDArray[np.float64] = points @ T[:3, :3].T + T[:3, 3]
+    return moved
+
+
+def _lines(ax: Axes, place: Scene, axes: tuple[int, int]) -> None:
+    if place.truth is not None:
+        true = place.truth[thin(len(place.truth), PATH_POINTS)][:, axes]
+        ax.plot(*true.T, color=PALETTE["truth"], lw=2.6, label="truth", zorder=3)
+    keep = thin(len(place.positions), PATH_POINTS)
+    path = gaps_as_nan(place.stamps_ns[keep], place.positions[keep][:, axes])
+    ax.plot(*path.T, color=PALETTE["estimate"], lw=1.4, label="path", zorder=4)
+
+
+def _joins(ax: Axes, keyframes: NDArray[np.float64], view: MapView) -> None:
+    """Join keyframes that share landmarks: one element for each strength."""
+    if not len(view.pairs):
+        return
+    strength = np.log2(view.shared / view.least).astype(np.int64).clip(0, len(ALPHAS) - 1)
+    for k in np.unique(strength).tolist():
+        ends = keyframes[view.pairs[strength == k]]
+        _strokes(ax, ends, color=PALETTE["good"], lw=0.7, alpha=ALPHAS[k], zorder=2)
+
+
+def _dots(ax: Axes, points: NDArray[np.float64], size: float, **style: Any) -> None:
+    """Draw round dots, as strokes too short to be seen with round ends."""
+    if len(points):
+        short = np.array([1e-4 * float(np.ptp(points)) + 1e-9, 0.0])
+        _strokes(ax, np.stack([points, points + short], axis=1), lw=size, **style)
+
+
+def _strokes(ax: Axes, ends: NDArray[np.float64], **style: Any) -> None:
+    """Draw (n, 2, 2) straight strokes as one element."""
+    path = Path(ends.reshape(-1, 2), np.tile([Path.MOVETO, Path.LINETO], len(ends)))
+    path.should_simplify = False  # which would take dots for noise
+    ax.add_patch(PathPatch(path, fill=False, capstyle="round", **style))
+
+
+def _window(ax: Axes, place: Scene, landmarks: NDArray[np.float64], axes: tuple[int, int]) -> None:
+    """Show the whole path, and around it what is near enough to be told apart."""
+    path = place.positions if place.truth is None else np.r_[place.positions, place.truth]
+    low, high = path.min(axis=0), path.max(axis=0)
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1.0)
+    near = landmarks[np.linalg.norm(landmarks - (low + high) / 2, axis=1) < REACH * radius]
+    low, high = low[list(axes)], high[list(axes)]
+    if len(near):
+        usual = np.percentile(near[:, axes], [USUAL, 100.0 - USUAL], axis=0)
+        low, high = np.minimum(low, usual[0]), np.maximum(high, usual[1])
+    _frame(ax, (low + high) / 2, 1.08 * np.maximum(high - low, 1e-3))
+
+
+def _frame(ax: Axes, middle: NDArray[np.float64], size: NDArray[np.float64]) -> None:
+    """Show at least so much around a middle, with equal scales, in the whole of the axes."""
+    figure = ax.get_figure()
+    assert figure is not None
+    box = ax.get_position()
+    wide = box.width * figure.bbox.width / (box.height * figure.bbox.height)
+    half = max(float(size[1]), float(size[0]) / wide) / 2
+    ax.set_xlim(middle[0] - half * wide, middle[0] + half * wide)
+    ax.set_ylim(middle[1] - half, middle[1] + half)
+    ax.set_aspect("equal", adjustable="box")
