@@ -1,0 +1,183 @@
+"""Hamming distance of binary descriptors, in words of 64 bits, and searches by it.
+
+The distance of two descriptors of 256 bits is the number of bits that differ,
+
+    d(a, b) = Σ_k popcount(a_k xor b_k),   k = 1..4,
+
+the four words counted by adding neighbouring bits, pairs and nibbles in parallel, a form that
+compilers turn into the processor's own instruction. One distance takes some 2 ns.
+The kernels here search circles, lines or everything; `matching` says what for.
+
+Reference: Calonder, Lepetit, Strecha, Fua, "BRIEF: binary robust independent elementary features",
+ECCV 2010; Warren, "Hacker's Delight", section 5-1.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.kernels import kernel
+
+__all__ = [
+    "CELL_PX",
+    "NO_DISTANCE",
+    "as_words",
+    "hamming",
+    "search_all",
+    "search_circles",
+    "search_lines",
+    "warm_up",
+]
+
+Words = NDArray[np.uint64]
+Index = NDArray[np.int64]
+
+NO_DISTANCE = 257
+"""Distance to nothing: more bits than there are."""
+CELL_PX = 16.0
+"""Side of the cells of a grid of keypoints."""
+
+
+def as_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Return (N, 32) uint8 descriptors as (N, 4) uint64, without a copy where possible."""
+    whole = np.ascontiguousarray(descriptors, np.uint8).reshape(len(descriptors), 32)
+    return np.require(whole.view(np.uint64), requirements=["C", "A"])
+
+
+@kernel
+def hamming(a: NDArray[np.uint64], i: int, b: NDArray[np.uint64], j: int) -> int:
+    """Σ_k popcount(a[i, k] xor b[j, k]) over the four words of two descriptors."""
+    total = 0
+    for k in range(4):
+        x = a[i, k] ^ b[j, k]
+        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+        x = (x & np.uint64(0x3333333333333333)) + (
+            (x >> np.uint64(2)) & np.uint64(0x3333333333333333)
+        )
+        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+        total += np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return total
+
+
+@kernel
+def _cells_around(at: float, radius: float, count: int) -> tuple[int, int]:
+    """First and last cell, of so many in a row, that an interval touches."""
+    first = int(min(max((at - radius) / CELL_PX, 0.0), count - 1.0))
+    last = int(min(max((at + radius) / CELL_PX, 0.0), count - 1.0))
+    return first, last
+
+
+@kernel
+def search_circles(
+    wanted: Words,
+    guess: NDArray[np.float64],
+    radius: NDArray[np.float64],
+    lowest: Index,
+    highest: Index,
+    descriptors: Words,
+    keypoints: NDArray[np.float32],
+    levels: NDArray[np.uint8],
+    start: Index,
+    order: Index,
+    cols: int,
+    ratio: float,
+    limit: int,
+    matches: Index,
+) -> None:
+    """For each landmark the nearest descriptor in its circle, if clearly the nearest."""
+    rows = (len(start) - 1) // cols
+    owner = np.full(len(descriptors), -1, np.int64)
+    distances = np.full(len(descriptors), NO_DISTANCE, np.int64)
+    for m in range(len(wanted)):
+        x, y, r = guess[m, 0], guess[m, 1], radius[m]
+        if not (np.isfinite(x) and np.isfinite(y) and r >= 0.0):
+            continue
+        best, second, index, rival = NO_DISTANCE, NO_DISTANCE, -1, -1
+        first_col, last_col = _cells_around(x, r, cols)
+        first_row, last_row = _cells_around(y, r, rows)
+        for row in range(first_row, last_row + 1):
+            for k in range(start[row * cols + first_col], start[row * cols + last_col + 1]):
+                n = order[k]
+                dx, dy = keypoints[n, 0] - x, keypoints[n, 1] - y
+                if not (dx * dx + dy * dy <= r * r):
+                    continue
+                if levels[n] < lowest[m] or levels[n] > highest[m]:
+                    continue
+                d = hamming(wanted, m, descriptors, n)
+                if d < best or (d == best and n < index):
+                    best, second, index, rival = d, best, n, index
+                elif d < second or (d == second and n < rival):
+                    second, rival = d, n
+        if index < 0 or best > limit or best >= distances[index]:
+            continue
+        if rival >= 0 and levels[rival] == levels[index] and best >= ratio * second:
+            continue
+        if owner[index] >= 0:
+            matches[owner[index]] = -1
+        matches[m], owner[index], distances[index] = index, m, best
+
+
+@kernel
+def search_lines(
+    first: Words,
+    lines: NDArray[np.float64],
+    second: Words,
+    plane: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    levels: NDArray[np.uint8],
+    ratio: float,
+    limit: int,
+    matches: Index,
+) -> None:
+    """For each line the nearest descriptor of the points that pass the χ² test; both ways best."""
+    number = len(second)
+    near = np.zeros((number + 7) // 8 * 8, np.uint8)
+    words = near.view(np.uint64)
+    owner = np.full(number, -1, np.int64)
+    distances = np.full(number, NO_DISTANCE, np.int64)
+    us, vs = plane[0], plane[1]
+    for i in range(len(first)):
+        a, b, c = lines[i, 0], lines[i, 1], lines[i, 2]
+        norm = a * a + b * b
+        for j in range(number):
+            off = a * us[j] + b * vs[j] + c
+            near[j] = off * off <= limits[j] * norm
+        best, second_best, index, rival = NO_DISTANCE, NO_DISTANCE, -1, -1
+        for word in range(len(words)):
+            if words[word] == 0:
+                continue
+            for j in range(8 * word, min(8 * word + 8, number)):
+                if near[j] == 0:
+                    continue
+                d = hamming(first, i, second, j)
+                if d < distances[j]:
+                    distances[j], owner[j] = d, i
+                if d < best:
+                    best, second_best, index, rival = d, best, j, index
+                elif d < second_best:
+                    second_best, rival = d, j
+        if index < 0 or best > limit or not norm > 0.0:
+            continue
+        if rival >= 0 and levels[rival] == levels[index] and best >= ratio * second_best:
+            continue
+        matches[i] = index
+    for i in range(len(first)):
+        if matches[i] >= 0 and owner[matches[i]] != i:
+            matches[i] = -1
+
+
+@kernel
+def search_all(first: Words, second: Words, index: Index, best: Index, other: Index) -> None:
+    """min_j d(i, j), where it is, and the second smallest."""
+    for i in range(len(first)):
+        for j in range(len(second)):
+            d = hamming(first, i, second, j)
+            if d < best[i]:
+                best[i], other[i], index[i] = d, best[i], j
+            elif d < other[i]:
+                other[i] = d
+
+
+def warm_up() -> None:
+    """Compile the kernel of this module."""
+    words = as_words(np.zeros((1, 32), np.uint8))
+    hamming(words, 0, words, 0)
