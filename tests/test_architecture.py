@@ -24,6 +24,7 @@ MAY_IMPORT_THREADS = {
     "system/live.py": "tells observers that may be slow",
     "maps/skeleton.py": "the lock of the map",
     "run.py": "Ctrl-C as an event",
+    "viewing.py": "draws what a run tells it, and tells the run nothing",
 }
 
 MAX_FILE, MAX_FUNCTION, MAX_KERNEL = 400, 60, 120

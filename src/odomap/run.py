@@ -30,11 +30,13 @@ from odomap.settings import override, read_config
 if TYPE_CHECKING:
     from odomap.maps.map import Map
     from odomap.outputs import Outputs
+    from odomap.sensors.frame import Frame
     from odomap.sensors.rig import Rig
     from odomap.sources.source import Source
     from odomap.system.config import Config
     from odomap.system.odometry import Odometry, Result
     from odomap.system.worker import Worker
+    from odomap.viewing import View
 
 __all__ = ["Interrupted", "Progress", "RunResult", "chosen_config", "run"]
 
@@ -110,6 +112,7 @@ def run(
     max_frames: int | None = None,
     progress: Callable[[Progress], None] | None = None,
     origin: Mapping[str, object] | None = None,
+    view: "View | bool" = False,
 ) -> RunResult:
     """Track a recording from end to end, and write its results.
 
@@ -125,6 +128,7 @@ def run(
         max_frames: stop after this many frames.
         progress: called with a `Progress` as the run goes on.
         origin: extra keys for the head of config.yaml.
+        view: True shows the run in the browser while it lasts; a `View` stays open.
 
     Returns:
         Trajectories, map, metrics; `failure` says why there is no usable path.
@@ -144,8 +148,10 @@ def run(
     from odomap.sources.source import Source
     from odomap.system.rhythms import check_rhythm
     from odomap.system.worker import deferred_interrupt
+    from odomap.viewing import check_view, watching
 
     check_rhythm(rhythm)
+    check_view(view)
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
     chosen_config(preset, config)  # a wrong name is told before anything is opened
@@ -159,9 +165,10 @@ def run(
     compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
     system = _system(source, settings, rhythm, head)
-    with deferred_interrupt() as interrupt, closing(system.worker):
+    shown = watching(view, system, source.rig, settings)
+    with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
-            broken = _track(source, system, logbook, outputs, max_frames, tell, interrupt)
+            broken = _track(source, system, logbook, outputs, max_frames, tell, interrupt, see)
         except CalibrationError as error:  # found while tracking: say of which recording
             raise CalibrationError(f"{head['data']}: {error}") from error
         result = system.finish()
@@ -254,6 +261,7 @@ def _track(
     max_frames: int | None,
     tell: Callable[[Progress], None],
     interrupt: threading.Event,
+    see: "Callable[[Frame], object]",
 ) -> CalibrationError | None:
     """Track frame after frame until the source, the limit or the user ends it.
 
@@ -267,6 +275,7 @@ def _track(
     # Closed in the end: a camera is let go, and says what there is to say of it.
     with closing(system.worker.frames(source, interrupt)) as frames:
         for frame in frames:
+            see(frame)
             start = time.perf_counter()
             try:
                 estimate = system.worker.advance(frame)

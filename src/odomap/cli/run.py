@@ -1,6 +1,7 @@
 """`odomap run`: from a recording to its path, map, numbers and report."""
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,6 +13,7 @@ from odomap.cli.progress import TrackingProgress
 if TYPE_CHECKING:
     from odomap.run import RunResult
     from odomap.system.config import Config
+    from odomap.viewing import View
 
 __all__ = ["Run", "conclude", "track"]
 
@@ -44,6 +46,12 @@ class Run:
     """Stop after this many frames."""
     quiet: bool = False
     """No progress."""
+    view: bool = False
+    """Show the run in the browser while it goes on, and afterwards until Ctrl-C."""
+    view_host: str = "127.0.0.1"
+    """Address of the view's page; 0.0.0.0 lets other machines look."""
+    view_port: int = 8080
+    """Port of the view's page; if it is taken, the next free one."""
     overrides: Overrides = ()
 
     def execute(self) -> int:
@@ -60,7 +68,20 @@ class Run:
             command["preset"] = self.preset
         if self.rig:
             command["rig"] = str(self.rig)
-        return track(source, out, config, command, self.max_frames, self.quiet, self.rhythm)[0]
+        with self._view() as view:
+            code, _ = track(
+                source, out, config, command, self.max_frames, self.quiet, self.rhythm, view
+            )
+            if view is not None and code != 130:
+                view.wait()
+        return code
+
+    def _view(self) -> "AbstractContextManager[View | None]":
+        if not self.view:
+            return nullcontext()
+        from odomap.viewing import View
+
+        return View(self.view_host, self.view_port)
 
 
 def folder_name(name: str) -> str:
@@ -76,6 +97,7 @@ def track(
     max_frames: int | None,
     quiet: bool,
     rhythm: str = "lockstep",
+    view: "View | None" = None,
 ) -> "tuple[int, RunResult]":
     """Run with progress, print the conclusion, and return the exit code with the result."""
     from odomap.run import Interrupted, run
@@ -91,6 +113,7 @@ def track(
                 max_frames=max_frames,
                 progress=progress.show,
                 origin=origin,
+                view=view or False,
             )
     except Interrupted as stop:
         result, code = stop.result, 130

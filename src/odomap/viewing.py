@@ -1,0 +1,319 @@
+"""The live view beside a run, and the same view of a run that is over.
+
+    view = View()                       prints the address of its page
+    view.watch(slam, source.rig, config)
+    for frame in source:
+        view.see(frame)
+        slam.track(frame)
+    view.wait()
+
+A view is an observer. In the tracker's thread it only drops what it is given into a mailbox of
+limited size, some microseconds; a thread of its own empties that a few times per second, reads the
+map a little at a time (`views.livemap`), and draws for whoever has the page open; where nobody
+looks it draws nothing. It decides nothing, and nothing in a run waits for it: the files of a run
+are the same bytes with it and without. If drawing fails the view stays as it is and says so once.
+"""
+
+import logging
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.pose import SE3
+from odomap.maps.estimate import Estimate, Status
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
+from odomap.sensors.frame import Frame
+from odomap.sensors.rig import CameraMount, Rig
+from odomap.system.feed import Mailbox
+from odomap.views.livemap import LandmarkSample, LivePath, Sketch, sketch
+from odomap.views.livepicture import picture
+from odomap.views.livescene import LiveScene, Panel
+from odomap.views.liveserver import HOST, PORT, check_viewer, close_server, open_server
+
+if TYPE_CHECKING:
+    from odomap.system.config import Config
+    from odomap.system.stages import MapState
+    from odomap.system.worker import Worker
+
+__all__ = ["View", "check_view", "watching"]
+
+Array = NDArray[np.float64]
+
+DRAW_EVERY_S = 0.08
+MAP_EVERY_S = 0.5
+MESSAGES = 1024
+"""Estimates that may wait to be drawn."""
+RECENT = 4
+"""Frames kept until their estimate comes."""
+PATIENCE_S = 5.0
+"""How long drawing may take when it is no longer wanted."""
+ENOUGH = 20
+"""Landmarks in sight that tell how far a camera sees."""
+FAREWELL = "the view stays open: {} (Ctrl-C ends it)"
+
+
+class Watched(Protocol):
+    """What can be watched: a map, and a worker that tells of it."""
+
+    map: Map
+    worker: "Worker"
+
+
+class View:
+    """A page in the browser that shows a run while it goes on.
+
+    Args:
+        host: address to listen on; the default lets nobody in from outside.
+        port: port wanted; the next free one is taken.
+
+    Attributes:
+        url: address of the page.
+
+    Raises:
+        MissingExtra: viser is not installed.
+        InputError: no such address, or no free port.
+    """
+
+    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+        self._server, self.url = open_server(host, port)
+        print(f"odomap: view: {self.url}", file=sys.stderr, flush=True)
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def watch(self, system: Watched, rig: Rig, config: "Config") -> None:
+        """Show a system from now on, in place of one before.
+
+        Args:
+            system: a SLAM system or odometry.
+            rig: of its frames.
+            config: its configuration, which says the cameras that it tracks.
+        """
+        self._stop()
+        self._drawing = _Drawing(self._server, system.map, *tracked_camera(rig, config))
+        self._frames: tuple[Frame, ...] = ()
+        worker = system.worker
+        worker.on_estimate.append(self._on_estimate)
+        worker.on_keyframe.append(self._on_keyframe)
+        worker.on_map.append(self._on_map)
+        self._over = threading.Event()
+        # A daemon: a program that ends without closing its view ends all the same.
+        self._thread = threading.Thread(target=self._draw_on, name="odomap view", daemon=True)
+        self._thread.start()
+
+    def see(self, frame: Frame) -> None:
+        """Remember the frame that is tracked next, for its image."""
+        self._frames = (*self._frames[1 - RECENT :], frame)
+
+    def wait(self) -> None:
+        """Keep the page open until Ctrl-C; without a terminal, return at once."""
+        if not sys.stderr.isatty():
+            return
+        print(f"odomap: {FAREWELL.format(self.url)}", file=sys.stderr, flush=True)
+        serve()
+
+    def close(self) -> None:
+        """Close the page and end its threads."""
+        self._stop()
+        close_server(self._server)
+
+    def _stop(self) -> None:
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(PATIENCE_S)
+            self._thread = None
+
+    # ---- in the tracker's thread ----
+
+    def _on_estimate(self, estimate: Estimate) -> None:
+        frame = next((f for f in reversed(self._frames) if f.id == estimate.frame_id), None)
+        self._drawing.tell(estimate, frame)
+
+    def _on_keyframe(self, keyframe: Keyframe) -> None:
+        self._drawing.is_stale = True
+
+    def _on_map(self, state: "MapState") -> None:
+        self._drawing.is_stale = True
+
+    # ---- in the thread of the view ----
+
+    def _draw_on(self) -> None:
+        drawing, over = self._drawing, self._over
+        try:
+            while not over.wait(DRAW_EVERY_S):
+                drawing.go_on(time.perf_counter())
+        except Exception as error:
+            logging.getLogger(__name__).error(
+                "the view has stopped; the run goes on", exc_info=error
+            )
+
+
+class _Drawing:
+    """What is known of a run, and drawn from."""
+
+    def __init__(
+        self, server: Any, map: Map, index: int, mount: CameraMount, T_body_camera: SE3
+    ) -> None:
+        self.is_stale = True
+        self._map, self._index, self._T_body_camera = map, index, T_body_camera
+        self._mailbox: Mailbox[Estimate] = Mailbox(MESSAGES)
+        self._scene = LiveScene(server, mount.camera)
+        self._path = LivePath(T_body_camera.t)
+        self._sample = LandmarkSample()
+        self._sample.add(map.landmark_ids)  # of a map that is gone on with
+        self._latest: tuple[Estimate, Frame | None] | None = None
+        self._first: SE3 | None = None
+        self._drawn: Estimate | None = None
+        self._read_s = -np.inf
+        self._is_facing = False
+        self._tail: list[Array] = []
+        self._laps: deque[float] = deque(maxlen=30)
+        self._num_landmarks = self._num_keyframes = 0
+
+    def tell(self, estimate: Estimate, frame: Frame | None) -> None:
+        """Take note of an estimate; from the tracker's thread."""
+        self._mailbox.put(estimate)
+        self._latest = estimate, frame
+
+    def go_on(self, now_s: float) -> None:
+        """Take in what has come, and draw it if somebody looks."""
+        while (estimate := self._mailbox.take(0.0)) is not None:
+            self._take_in(estimate)
+        if not self._scene.has_viewers:
+            return
+        if self.is_stale and now_s - self._read_s >= MAP_EVERY_S:
+            self.is_stale, self._read_s = False, now_s
+            self._show_map()
+        self._show_frame()
+        self._scene.obey()
+
+    def _take_in(self, estimate: Estimate) -> None:
+        self._path.add(estimate)
+        self._laps.append(sum(estimate.timing.values()))
+        if estimate.keyframe_id < 0:
+            return
+        T_world_camera = estimate.T_world_body @ self._T_body_camera
+        if self._first is None:
+            self._first = T_world_camera
+        self._tail.append(T_world_camera.t)
+        self._tail = self._tail[-MESSAGES:]
+
+    def _show_map(self) -> None:
+        seen = sketch(self._map, self._sample)
+        self._num_landmarks, self._num_keyframes = seen.num_landmarks, len(seen.Ts_world_body)
+        if not self._is_facing and self._first is not None:
+            reach = distance_seen(seen, self._T_body_camera)
+            if reach is not None:
+                self._is_facing = True
+                self._scene.face(self._first.matrix, reach)
+        Ts_world_camera = seen.Ts_world_body @ self._T_body_camera.matrix
+        self._scene.show_map(seen.points, seen.is_seen, Ts_world_camera)
+        positions, is_lost = self._path.positions(self._map)
+        self._scene.show_path(positions, is_lost)
+        self._tail = list(positions[-1:])
+
+    def _show_frame(self) -> None:
+        if self._latest is None:
+            return
+        estimate, frame = self._latest
+        T_world_camera = estimate.T_world_body @ self._T_body_camera
+        if estimate is not self._drawn:
+            self._drawn = estimate
+            images = () if frame is None else frame.images
+            raw = images[self._index] if self._index < len(images) else None
+            shown = None if raw is None else picture(raw, estimate.tracks)
+            is_lost = estimate.status == Status.LOST
+            self._scene.show_camera(
+                T_world_camera.matrix, T_world_camera.quaternion, shown, is_lost
+            )
+            if len(self._tail) > 1:
+                self._scene.show_tail(np.array(self._tail))
+            self._scene.say(self._panel(estimate))
+        self._scene.follow(T_world_camera.matrix)
+
+    def _panel(self, estimate: Estimate) -> Panel:
+        rows = [("frame", str(estimate.frame_id))]
+        if self._laps:
+            rows.append(("ms per frame", f"{np.median(self._laps):.1f}"))
+        rows.append(("inliers", str(estimate.num_inliers)))
+        rows.append(("keyframes", str(self._num_keyframes)))
+        rows.append(("landmarks", str(self._num_landmarks)))
+        return Panel(estimate.status.value, estimate.reason, tuple(rows))
+
+
+def tracked_camera(rig: Rig, config: "Config") -> tuple[int, CameraMount, SE3]:
+    """Return which image of a frame is tracked, its camera, and T_body_camera of the poses."""
+    sensors = config.tracking.sensors
+    if sensors == "stereo":
+        mount = rig.stereo_pair()[0]
+    elif sensors == "rgbd" and rig.depth is not None:
+        mount = rig.camera(rig.depth.camera)
+    else:  # one camera is the body: without a scale its path cannot carry the lever arm
+        return 0, rig.cameras[0], SE3.identity()
+    return rig.cameras.index(mount), mount, mount.T_body_camera
+
+
+def distance_seen(seen: Sketch, T_body_camera: SE3) -> float | None:
+    """Return how far the newest keyframe sees, world units; None where it sees too little."""
+    if seen.is_seen.sum() < ENOUGH or not len(seen.Ts_world_body):
+        return None
+    eye = (seen.Ts_world_body[-1] @ T_body_camera.matrix)[:3, 3]
+    return float(np.median(np.linalg.norm(seen.points[seen.is_seen] - eye, axis=1)))
+
+
+def serve() -> None:
+    """Do nothing until Ctrl-C."""
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        return
+
+
+def check_view(view: View | bool) -> None:
+    """Make sure that a view can be opened, where one is to be.
+
+    Raises:
+        MissingExtra: viser is not installed.
+    """
+    if view is True:
+        check_viewer()
+
+
+@contextmanager
+def watching(
+    view: View | bool, system: Watched, rig: Rig, config: "Config"
+) -> Iterator[Callable[[Frame], object]]:
+    """Let a view watch a run; one that is made here ends with it.
+
+    Args:
+        view: a view, True for one of its own, False for none.
+        system: what tracks.
+        rig: of the frames.
+        config: of the system.
+
+    Yields:
+        What to call with each frame before it is tracked.
+    """
+    if view is False:
+        yield lambda _: None
+        return
+    shown = View() if view is True else view
+    try:
+        shown.watch(system, rig, config)
+        yield shown.see
+    finally:
+        if view is True:
+            shown.close()

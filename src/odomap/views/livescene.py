@@ -1,0 +1,302 @@
+"""The scene of the live view: path, landmarks, keyframes, camera, and a panel beside them.
+
+The world of a run knows no up, since nobody told it of gravity; but cameras are seldom upside down.
+So up is what was up in the first image (y points down there), and the first look is from behind and
+above the first camera, as far away as what it sees. Lines are a few pixels thick, whatever the
+scale. Everything of one kind is one node of the scene: 3,000 keyframes are one set of lines, sent
+as one array.
+
+Nothing here reads a map or a clock; whoever calls decides how often (`odomap.viewing`).
+"""
+
+import contextlib
+import html
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.camera import Camera
+from odomap.views.livepicture import shrunk
+from odomap.views.scene import thin
+
+__all__ = ["LiveScene", "Panel"]
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+PATH: Colour = (86, 180, 233)
+LOST: Colour = (255, 84, 60)
+KEYFRAME: Colour = (230, 159, 0)
+CAMERA: Colour = (53, 224, 161)
+LANDMARK: Colour = (150, 160, 176)
+SEEN: Colour = (240, 228, 66)
+STATUS_COLOURS = {"tracking": CAMERA, "recovered": SEEN, "initializing": PATH, "lost": LOST}
+
+PATH_POINTS = 5000
+KEYFRAMES = 2000
+"""At most so many are drawn, spread evenly."""
+FRUSTUM_IMAGE_PX = 320
+WIDEST_VIEW = 1.2
+"""Frusta are at most so wide at distance 1, also those of a fisheye."""
+
+KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.05, 0.0035
+"""Sizes as shares of the distance to what the camera sees."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What the panel says.
+
+    Attributes:
+        status: of the last frame.
+        reason: what is wrong; empty when nothing is.
+        rows: further lines, name and value.
+    """
+
+    status: str
+    reason: str
+    rows: tuple[tuple[str, str], ...]
+
+
+class LiveScene:
+    """What is shown, on a server of pages.
+
+    Args:
+        server: from `liveserver.open_server`.
+        camera: the lens of the camera that is tracked.
+        frames: makes a slider over so many frames; 0 for none.
+
+    Attributes:
+        reach: distance to what the camera sees, world units; sizes follow it.
+    """
+
+    def __init__(self, server: Any, camera: Camera | None, frames: int = 0) -> None:
+        self._server = server
+        self.reach = 1.0
+        wide, high = _opening(camera)
+        self._opening = wide, high
+        self._met: set[int] = set()
+        server.scene.reset()
+        server.gui.reset()
+        self._make_panel(frames)
+        self._make_nodes(wide, high)
+
+    def _make_panel(self, frames: int) -> None:
+        gui = self._server.gui
+        self._words = gui.add_html("")
+        self._slider = None
+        if frames:
+            self._slider = gui.add_slider("frame", 0, max(frames - 1, 1), 1, frames - 1)
+        self._follow = gui.add_checkbox("follow camera", True)
+        self._shows_keyframes = gui.add_checkbox("keyframes", True)
+        self._point_size = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
+        self._picture: Any = None
+
+    def _make_nodes(self, wide: float, high: float) -> None:
+        scene = self._server.scene
+        none = np.zeros((0, 3), np.float32)
+
+        def lines(name: str, colour: Colour, thickness: float) -> Any:
+            return scene.add_line_segments(
+                name,
+                np.zeros((0, 2, 3), np.float32),
+                colour,
+                thickness=thickness,
+                thickness_units="screen",
+            )
+
+        self._path = {
+            lost: lines(f"/path/{name}", colour, 3.0)
+            for lost, name, colour in ((False, "known", PATH), (True, "lost", LOST))
+        }
+        self._tail = lines("/path/newest", PATH, 3.0)
+        self._keyframes = lines("/keyframes", KEYFRAME, 1.0)
+        self._points = scene.add_point_cloud(
+            "/landmarks", none, np.zeros((0, 3), np.uint8), precision="float32"
+        )
+        self._points.point_shape = "circle"
+        self._points.point_shading = "flat"
+        self._camera = scene.add_camera_frustum(
+            "/camera",
+            fov=2 * np.arctan(high),
+            aspect=wide / high,
+            color=CAMERA,
+            thickness=2.5,
+            thickness_units="screen",
+            visible=False,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    # ---- what is shown ----
+
+    def face(self, T_world_camera: Array, reach: float) -> None:
+        """Choose up and the first look from where a camera is and how far it sees.
+
+        Args:
+            T_world_camera: (4, 4) of the first image: x right, y down, z ahead.
+            reach: distance to what it sees, world units.
+        """
+        self.reach = reach
+        self._server.scene.set_up_direction(-T_world_camera[:3, 1])
+        start = self._server.initial_camera
+        start.position, start.look_at = _behind(T_world_camera, reach), T_world_camera[:3, 3]
+        start.near, start.far = 1e-3 * reach, 1e4 * reach
+        self._camera.scale = CAMERA_SIZE * reach
+        self._met.clear()
+
+    def show_path(self, positions: Array, is_lost: NDArray[np.bool_]) -> None:
+        """Draw the path so far.
+
+        Args:
+            positions: (N, 3) of the camera in the world.
+            is_lost: (N,) frames without a pose of their own.
+        """
+        keep = thin(len(positions), PATH_POINTS)
+        segments = np.stack([positions[keep[:-1]], positions[keep[1:]]], axis=1)
+        missing = np.concatenate([[0], np.cumsum(is_lost)])
+        lost = missing[keep[1:] + 1] > missing[keep[:-1]] if len(keep) else np.zeros(0, np.bool_)
+        with self._server.atomic():
+            for wanted, node in self._path.items():
+                node.points = segments[lost == wanted].astype(np.float32)
+            self._tail.points = np.zeros((0, 2, 3), np.float32)
+
+    def show_tail(self, positions: Array) -> None:
+        """Draw the (N, 3) newest positions, from the end of the path on."""
+        self._tail.points = np.stack([positions[:-1], positions[1:]], axis=1).astype(np.float32)
+
+    def show_map(self, points: Array, is_seen: NDArray[np.bool_], Ts_world_camera: Array) -> None:
+        """Draw landmarks and keyframes.
+
+        Args:
+            points: (M, 3) landmarks in the world.
+            is_seen: (M,) whether the newest keyframe sees them.
+            Ts_world_camera: (K, 4, 4) of the keyframes.
+        """
+        colours = np.where(is_seen[:, None], SEEN, LANDMARK).astype(np.uint8)
+        keep = thin(len(Ts_world_camera), KEYFRAMES)
+        with self._server.atomic():
+            self._points.points = points.astype(np.float32)
+            self._points.colors = colours
+            self._points.point_size = POINT_SIZE * self.reach * self._point_size.value
+            self._keyframes.points = frusta(
+                Ts_world_camera[keep], self._opening, KEYFRAME_SIZE * self.reach
+            )
+
+    def show_camera(
+        self, T_world_camera: Array, wxyz: Array, image: NDArray[np.uint8] | None, is_lost: bool
+    ) -> None:
+        """Draw the camera where it is now.
+
+        Args:
+            T_world_camera: (4, 4).
+            wxyz: (4,) its rotation.
+            image: (h, w, 3) RGB what it sees; None keeps the one before.
+            is_lost: whether it has no pose of its own.
+        """
+        with self._server.atomic():
+            self._camera.position = T_world_camera[:3, 3]
+            self._camera.wxyz = wxyz
+            self._camera.color = LOST if is_lost else CAMERA
+            self._camera.visible = True
+            if image is not None:
+                self._camera.image = shrunk(image, FRUSTUM_IMAGE_PX)
+                self._show_picture(image)
+
+    def _show_picture(self, image: NDArray[np.uint8]) -> None:
+        if self._picture is None:
+            self._picture = self._server.gui.add_image(image, jpeg_quality=80, order=1e9)
+        else:
+            self._picture.image = image
+
+    def say(self, panel: Panel) -> None:
+        """Write the panel."""
+        self._words.content = panel_html(panel)
+
+    # ---- who looks, and what they want ----
+
+    @property
+    def has_viewers(self) -> bool:
+        """Whether a page is open."""
+        return bool(self._server.get_clients())
+
+    @property
+    def frame(self) -> int:
+        """The frame that the slider is at, 0 without one."""
+        return 0 if self._slider is None else int(self._slider.value)
+
+    def obey(self) -> None:
+        """Do what the controls say that needs nothing but the scene."""
+        self._keyframes.visible = bool(self._shows_keyframes.value)
+        self._points.point_size = POINT_SIZE * self.reach * self._point_size.value
+
+    def follow(self, T_world_camera: Array) -> None:
+        """Keep the camera in the middle of every page; who just came is placed behind it.
+
+        The eye keeps its direction and distance, which are the viewer's to choose. They are taken
+        from what the page told last: also when that is late, it is right.
+        """
+        clients = self._server.get_clients()
+        target = T_world_camera[:3, 3]
+        for key, client in clients.items():
+            eye = client.camera
+            offset = eye.position - eye.look_at
+            if key not in self._met:
+                offset = _behind(T_world_camera, self.reach) - target
+            elif not self._follow.value:
+                continue
+            # A page that is closed at this instant is told nothing, and viser warns of it.
+            with contextlib.suppress(UserWarning), client.atomic():
+                eye.position = target + offset
+                eye.look_at = target
+        self._met = set(clients)
+
+
+def frusta(
+    Ts_world_camera: Array, opening: tuple[float, float], size: float
+) -> NDArray[np.float32]:
+    """Return the (8 K, 2, 3) edges of K cameras.
+
+    Args:
+        Ts_world_camera: (K, 4, 4).
+        opening: half width and half height of the image at distance 1.
+        size: length of a frustum, world units.
+    """
+    x, y = opening
+    tips = size * np.array([(0, 0, 0), (-x, -y, 1), (x, -y, 1), (x, y, 1), (-x, y, 1)])
+    edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+    R, t = Ts_world_camera[:, :3, :3], Ts_world_camera[:, :3, 3]
+    world = np.einsum("kij,nj->kni", R, tips) + t[:, None]
+    return np.asarray(world[:, edges].reshape(-1, 2, 3), np.float32)
+
+
+def panel_html(panel: Panel) -> str:
+    """Return the panel as a small table; what is not ours to know is escaped."""
+    colour = "#{:02x}{:02x}{:02x}".format(*STATUS_COLOURS.get(panel.status, LANDMARK))
+    head = f'<b style="color:{colour}">&#9679; {html.escape(panel.status)}</b>'
+    if panel.reason:
+        head += f'<div style="opacity:.8">{html.escape(panel.reason)}</div>'
+    lines = "".join(
+        f'<tr><td style="opacity:.7;padding-right:1em">{html.escape(name)}</td>'
+        f"<td>{html.escape(value)}</td></tr>"
+        for name, value in panel.rows
+    )
+    box = "padding:.3em 1em;font-size:.85em;font-variant-numeric:tabular-nums"
+    return f'<div style="{box}">{head}<table>{lines}</table></div>'
+
+
+def _opening(camera: Camera | None) -> tuple[float, float]:
+    """Return half the width and height of the image at distance 1."""
+    if camera is None:
+        return 0.6, 0.4
+    wide = min(0.5 * camera.width / camera.fx, WIDEST_VIEW)
+    return wide, wide * camera.height / camera.width
+
+
+def _behind(T_world_camera: Array, reach: float) -> Array:
+    """Return an eye behind and above a camera, a little to its right."""
+    right, down, ahead = T_world_camera[:3, :3].T
+    back = 0.6 * ahead + 0.35 * down - 0.15 * right
+    return np.asarray(T_world_camera[:3, 3] - reach * back)
