@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["distinct", "grown", "members", "offsets", "spans"]
+__all__ = ["distinct", "distinct_in_order", "grown", "members", "offsets", "positions", "spans"]
 
 S = TypeVar("S", bound=np.generic)
 
@@ -62,11 +62,28 @@ def distinct(values: NDArray[S]) -> NDArray[S]:
     return ordered[first]
 
 
+def distinct_in_order(values: NDArray[S]) -> NDArray[S]:
+    """Return the distinct values of (N,) integers in the order in which they first come."""
+    first = np.unique(values, return_index=True)[1]
+    return np.asarray(values[np.sort(first)])
+
+
 def members(values: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the distinct values of (N,) row numbers, ascending, in O(N + largest)."""
     is_member = np.zeros(int(values.max(initial=-1)) + 1, np.bool_)
     is_member[values] = True
     return np.flatnonzero(is_member)
+
+
+def positions(values: NDArray[np.int64], of: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where each of (N,) row numbers stands in the (M,) distinct ones `of`, -1 if nowhere.
+
+    O(N + M + largest).
+    """
+    highest = max(int(values.max(initial=-1)), int(of.max(initial=-1)))
+    place = np.full(highest + 1, -1, np.int32)
+    place[of] = np.arange(len(of), dtype=np.int32)
+    return place.take(values).astype(np.int64)
 
 
 def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -81,6 +81,13 @@ class Edges:
         self._information = table.information.copy()
         self._kind = list(table.kind)
 
+    def twin(self) -> "Edges":
+        """Return the edges there are now; rows are never written again, so none is copied."""
+        twin = Edges()
+        twin._ends, twin._Ts, twin._scales = self._ends, self._Ts, self._scales
+        twin._information, twin._kind = self._information, self._kind.copy()
+        return twin
+
     def table(self) -> EdgeTable:
         """Return all edges, copied."""
         rows = len(self._kind)

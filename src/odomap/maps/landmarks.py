@@ -5,17 +5,19 @@ anchor keyframe; in the world it is at T_world_anchor (s_anchor p_anchor), so th
 anchor when a loop closes. Rows (slots) are used again after a landmark is gone, ids never: a table
 id → slot is kept, in which the id of a fused landmark points at the id of its survivor, as in a
 union-find forest (R. Tarjan, Efficiency of a good but not linear set union algorithm, 1975).
-Looking up N ids is O(N). The table is compacted when it would grow: paths are shortened, dead ids
-at its beginning are cut off, so that odometry, which forgets what it passed, needs constant memory.
+Looking up N ids is O(N); paths are shortened on the way. Where the beginning of the table is dead,
+which is followed as landmarks are added, it is cut off when the table would grow, so that odometry,
+which forgets what it passed, needs constant memory.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import distinct, grown
+from odomap.maps.column import Column
+from odomap.maps.columns import distinct
 from odomap.maps.ragged import Ragged
 
 __all__ = ["Landmarks"]
@@ -36,19 +38,20 @@ class Landmarks:
     """
 
     def __init__(self) -> None:
-        self.ids = np.zeros(0, np.int64)
-        self.anchor = np.zeros(0, np.int32)
-        self.p_anchor = np.zeros((0, 3))
-        self.descriptor = np.zeros((0, 32), np.uint8)
-        self.seen = np.zeros(0, np.int32)
-        self.expected = np.zeros(0, np.int32)
+        self.ids = Column[np.int64].empty(np.int64)
+        self.anchor = Column[np.int32].empty(np.int32)
+        self.p_anchor = Column[np.float64].empty(np.float64, 3)
+        self.descriptor = Column[np.uint8].empty(np.uint8, 32)
+        self.seen = Column[np.int32].empty(np.int32)
+        self.expected = Column[np.int32].empty(np.int32)
         self._by_anchor = Ragged()
         self._free: list[int] = []
         self._end = 0
         # entry of id first + n: a slot, or _DEAD, or -2 - id of the survivor
-        self._entry = np.zeros(0, np.int64)
+        self._entry = Column[np.int64].empty(np.int64)
         self._first = 0
         self._next = 0
+        self._oldest = 0  # no id below it is of use
 
     def __len__(self) -> int:
         return self._end - len(self._free)
@@ -57,6 +60,20 @@ class Landmarks:
     def next_id(self) -> int:
         """The id that the next landmark will have."""
         return self._next
+
+    def columns(self) -> tuple[Column[Any], ...]:
+        """Return the columns that `twin` needs copies of."""
+        return (*self._by_slot(), self._entry)
+
+    def twin(self, copies: Iterator[Column[Any]]) -> "Landmarks":
+        """Return the same table, to be read only, made of copies of `columns`."""
+        twin = Landmarks()
+        twin.ids, twin.anchor, twin.p_anchor = next(copies), next(copies), next(copies)
+        twin.descriptor, twin.seen, twin.expected = next(copies), next(copies), next(copies)
+        twin._entry = next(copies)
+        twin._free, twin._end = self._free.copy(), self._end
+        twin._first, twin._next = self._first, self._next
+        return twin
 
     def dump(self) -> dict[str, NDArray[Any]]:
         """Return copies of all that decides how the table goes on.
@@ -67,7 +84,8 @@ class Landmarks:
             and survivor, the (F,) ids that mean another landmark, and its id.
         """
         slots = self.all_slots()
-        fused = self._first + np.flatnonzero(self._entry[: self._next - self._first] <= -2)
+        known = self._entry.values[: self._next - self._first]
+        fused = self._first + np.flatnonzero(known <= -2)
         heirs = self.slots(fused)
         return {
             "slot": slots,
@@ -87,33 +105,44 @@ class Landmarks:
         slots, ids = columns["slot"], columns["id"]
         self._free = columns["free"].tolist()
         self._end = len(slots) + len(self._free)
-        self.ids = grown(self.ids, self._end, fill=_DEAD)
-        self.anchor = grown(self.anchor, self._end)
-        self.p_anchor = grown(self.p_anchor, self._end)
-        self.descriptor = grown(self.descriptor, self._end)
-        self.seen = grown(self.seen, self._end)
-        self.expected = grown(self.expected, self._end)
+        for column in self._by_slot():
+            column.reserve(self._end)
+        self.ids[columns["free"]] = _DEAD
         self.ids[slots], self.anchor[slots] = ids, columns["anchor"]
         self.p_anchor[slots], self.seen[slots] = columns["p_anchor"], columns["seen"]
-        self.expected[slots] = columns["expected"]
-        self.descriptor[slots] = columns["descriptor"]
+        self.descriptor[slots], self.expected[slots] = columns["descriptor"], columns["expected"]
         self._by_anchor.append(columns["anchor"].astype(np.int64), slots.astype(np.int32))
         oldest = (int(known.min(initial=next_id)) for known in (ids, columns["fused"]))
-        self._first, self._next = min(oldest), next_id
-        self._entry = np.full(next_id - self._first, _DEAD, np.int64)
+        self._first = self._oldest = min(oldest)
+        self._next = next_id
+        self._entry.reserve(next_id - self._first)
+        self._entry[: next_id - self._first] = _DEAD
         self._entry[ids - self._first] = slots
         self._entry[columns["fused"] - self._first] = -2 - columns["survivor"]
 
     def slots(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the (N,) slots of (N,) ids; a fused id gives its survivor's, a dead one -1."""
         entry = self._lookup(ids)
-        while (forward := entry <= -2).any():
-            entry[forward] = self._lookup(-2 - entry[forward])
+        fused = np.flatnonzero(entry <= -2)
+        if not len(fused):
+            return entry
+        heirs = -2 - entry[fused]
+        found = self._lookup(heirs)
+        while (forward := found <= -2).any():
+            heirs[forward] = -2 - found[forward]
+            found = self._lookup(heirs)
+        self._entry[ids[fused] - self._first] = np.where(found >= 0, -2 - heirs, _DEAD)
+        entry[fused] = found
         return entry
 
     def all_slots(self) -> NDArray[np.int64]:
         """Return the slots in use, in order."""
-        return np.flatnonzero(self.ids[: self._end] >= 0)
+        return np.flatnonzero(self.ids.values[: self._end] >= 0)
+
+    def all_ids(self) -> NDArray[np.int64]:
+        """Return the ids of living landmarks, ascending."""
+        known = self._entry.values[: self._next - self._first]
+        return self._first + np.flatnonzero(known >= 0)
 
     def anchored(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the slots of all landmarks stored relative to some keyframes."""
@@ -138,17 +167,15 @@ class Landmarks:
         number = len(p_anchor)
         slots = self._new_slots(number)
         ids = self._next + np.arange(number, dtype=np.int64)
-        if self._next + number - self._first > len(self._entry):
-            self._compact()
-            self._entry = grown(self._entry, self._next + number - self._first, fill=_DEAD)
+        self._follow_the_oldest(number)
         self._next += number
+        self._entry.reserve(self._next - self._first)
         self._entry[ids - self._first] = slots
         self.ids[slots] = ids
         self.anchor[slots] = anchors
         self.p_anchor[slots] = p_anchor
         self.descriptor[slots] = 0 if descriptors is None else descriptors
-        self.seen[slots] = 0
-        self.expected[slots] = 0
+        self.seen[slots] = self.expected[slots] = 0
         self._by_anchor.append(anchors, slots.astype(np.int32))
         return ids
 
@@ -171,8 +198,8 @@ class Landmarks:
 
     def forward(self, gone: NDArray[np.int64], survivors: NDArray[np.int64]) -> None:
         """Remove the landmarks in N distinct slots; their ids follow those in N other slots."""
-        np.add.at(self.seen, survivors, self.seen[gone])
-        np.add.at(self.expected, survivors, self.expected[gone])
+        self.seen.add(survivors, self.seen[gone])
+        self.expected.add(survivors, self.expected[gone])
         self._entry[self.ids[gone] - self._first] = -2 - self.ids[survivors]
         self._vacate(gone)
 
@@ -184,18 +211,23 @@ class Landmarks:
         entry[known] = self._entry[ids[known] - self._first]
         return entry
 
-    def _compact(self) -> None:
-        """Let every fused id point at its last survivor, and cut dead ids off the beginning."""
-        known = self._next - self._first
-        ids = self._first + np.arange(known, dtype=np.int64)
-        fused = np.flatnonzero(self._entry[:known] <= -2)
-        slots = self.slots(ids[fused])
-        self._entry[fused] = np.where(slots >= 0, -2 - self.ids[slots], _DEAD)
-        living = np.flatnonzero(self._entry[:known] != _DEAD)
-        cut = int(living[0]) if len(living) else known
-        if 2 * cut >= known:
-            self._entry = self._entry[cut:].copy()
-            self._first += cut
+    def _follow_the_oldest(self, number: int) -> None:
+        """Pass over dead ids at the beginning of the table; cut them off when most are dead."""
+        start = self._oldest - self._first
+        stop = min(start + 8 * number + 1024, self._next - self._first)
+        ids = self._first + np.arange(start, stop, dtype=np.int64)
+        alive = np.flatnonzero(self.slots(ids) >= 0)
+        self._oldest += int(alive[0]) if len(alive) else len(ids)
+        cut, known = self._oldest - self._first, self._next - self._first
+        if 2 * cut > known + 1024 and not self._entry.is_followed:
+            living = self._entry.values[cut:known]
+            self._entry = Column[np.int64].empty(np.int64)
+            self._entry.reserve(len(living))
+            self._entry[: len(living)] = living
+            self._first = self._oldest
+
+    def _by_slot(self) -> tuple[Column[Any], ...]:
+        return self.ids, self.anchor, self.p_anchor, self.descriptor, self.seen, self.expected
 
     def _leave_anchors(self, slots: NDArray[np.int64]) -> None:
         stays = np.ones(self._end, np.bool_)
@@ -213,10 +245,6 @@ class Landmarks:
         del self._free[cut:]
         fresh = self._end + np.arange(number - len(reused), dtype=np.int64)
         self._end += len(fresh)
-        self.ids = grown(self.ids, self._end, fill=-1)
-        self.anchor = grown(self.anchor, self._end)
-        self.p_anchor = grown(self.p_anchor, self._end)
-        self.descriptor = grown(self.descriptor, self._end)
-        self.seen = grown(self.seen, self._end)
-        self.expected = grown(self.expected, self._end)
+        for column in self._by_slot():
+            column.reserve(self._end)
         return np.concatenate([np.asarray(reused, np.int64), fresh])

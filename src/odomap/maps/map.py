@@ -14,13 +14,15 @@ Reference: R. Mur-Artal, J. Montiel, J. Tardós, ORB-SLAM: a versatile and accur
 system, 2015.
 """
 
+import time
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
-from odomap.maps.columns import distinct, members
+from odomap.maps.columns import distinct, distinct_in_order, members, positions
+from odomap.maps.copying import Copying
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
 from odomap.maps.surroundings import Surroundings
@@ -28,6 +30,10 @@ from odomap.maps.tables import MapTables
 from odomap.maps.tree import ALIVE
 
 __all__ = ["Map"]
+
+
+PAUSE_S = 5e-5
+"""Seconds for which the lock is left to others between two steps of a copy."""
 
 
 class Map(Surroundings):
@@ -41,26 +47,55 @@ class Map(Surroundings):
     def dump(self) -> MapTables:
         """Return all that is remembered, as arrays: what `restored` makes a map of again.
 
-        The lock is held for as long as it takes to copy the map.
+        It is the map of one moment, though the lock is never held for as long as copying takes.
         """
+        twin = self._twin()
+        rows = len(twin.states)
+        tables = {
+            "states": twin.states.dump(),
+            "tree": twin._tree.dump(rows),
+            "landmarks": twin._landmarks.dump(),
+            "observations": twin._observations.dump(rows),
+        }
+        return MapTables(
+            columns={f"{t}/{c}": a for t, table in tables.items() for c, a in table.items()},
+            keyframes=tuple(twin._keyframes[k] for k in sorted(twin._keyframes)),
+            edges=twin._edges.table(),
+            version=twin.version,
+            epoch=twin.epoch,
+            newest=twin._newest,
+            next_keyframe=twin._next_keyframe,
+            next_landmark=twin._landmarks.next_id,
+        )
+
+    def _twin(self) -> "Map":
+        """Return the map as it is at one moment, to be read only; copied in small steps."""
         with self.lock:
-            rows = len(self.states)
-            tables = {
-                "states": self.states.dump(),
-                "tree": self._tree.dump(rows),
-                "landmarks": self._landmarks.dump(),
-                "observations": self._observations.dump(rows),
-            }
-            return MapTables(
-                columns={f"{t}/{c}": a for t, table in tables.items() for c, a in table.items()},
-                keyframes=tuple(self._keyframes[k] for k in sorted(self._keyframes)),
-                edges=self._edges.table(),
-                version=self.version,
-                epoch=self.epoch,
-                newest=self._newest,
-                next_keyframe=self._next_keyframe,
-                next_landmark=self._landmarks.next_id,
-            )
+            copying = Copying([*self._landmarks.columns(), *self._observations.columns()])
+        try:
+            while not self._is_nearly_copied(copying):
+                # The lock is not fair: without a pause it would be taken again before a thread
+                # that waits for it has woken.
+                time.sleep(PAUSE_S)
+            with self.lock:
+                copies = copying.finished()
+                twin = Map()
+                twin.states, twin._tree = self.states.twin(), self._tree.twin()
+                twin._landmarks = self._landmarks.twin(copies)
+                twin._observations = self._observations.twin(copies)
+                twin._keyframes, twin._edges = self._keyframes.copy(), self._edges.twin()
+                twin._newest, twin._next_keyframe = self._newest, self._next_keyframe
+                twin.version, twin.epoch = self.version, self.epoch
+                return twin
+        finally:
+            with self.lock:
+                copying.close()
+
+    def _is_nearly_copied(self, copying: Copying) -> bool:
+        with self.lock:
+            if not copying.is_nearly_done:
+                copying.step()
+            return copying.is_nearly_done
 
     @classmethod
     def restored(cls, tables: MapTables) -> Self:
@@ -141,37 +176,40 @@ class Map(Surroundings):
             The keyframes in the order given, fixed ones last, with the landmarks that a free one
             sees and all their observations in these keyframes.
         """
+        free, held = self._ids(keyframe_ids), distinct_in_order(self._ids(fixed_ids))
+        free = distinct_in_order(free[~np.isin(free, held)])
         with self.lock:
-            free = self._ids(keyframe_ids)
-            held = dict.fromkeys(self._ids(fixed_ids).tolist())
-            wanted = [k for k in dict.fromkeys(free.tolist()) if k not in held] + list(held)
-            kept = [k for k in wanted if self._known(k) in self._keyframes]
-            if not kept:
+            ids = self._all_known(np.concatenate([free, held]))
+            ids = ids[self._tree.status[ids] == ALIVE]
+            if not len(ids):
                 raise ValueError("a snapshot needs a keyframe that is in the map")
-            ids = np.asarray(kept, np.int64)
-            is_fixed = np.array([k in held for k in kept])
+            is_fixed = np.isin(ids, held)
             indptr, rows = self._observations.of_keyframes(ids if landmarks else ids[:0])
-            _, slots, keypoints = self._observations.columns(rows)
+            _, slots, keypoints = self._observations.read(rows)
             position = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
             seen = members(slots[~is_fixed[position]])
-            index = self._observations.positions(slots, seen)
-            used = index >= 0
             Ts, scales = self.states.placements(ids)
-            return Snapshot(
-                keyframes=tuple(self._keyframes[k] for k in kept),
-                keyframe_ids=ids,
-                is_fixed=is_fixed,
-                Ts_world_body=Ts,
-                scales=scales,
-                landmark_ids=self._landmarks.ids[seen],
-                points_world=self._points(seen),
-                obs_keyframe=position[used],
-                obs_landmark=index[used],
-                obs_keypoint=keypoints[used],
-                anchor_id=int(ids[is_fixed][0]) if is_fixed.any() else int(ids[0]),
-                version=self.version,
-                epoch=self.epoch,
-            )
+            landmark_ids = self._landmarks.ids[seen]
+            points = self._points(seen)
+            keyframes = tuple(self._keyframes[k] for k in ids.tolist())
+            version, epoch = self.version, self.epoch
+        index = positions(slots, seen)
+        used = index >= 0
+        return Snapshot(
+            keyframes=keyframes,
+            keyframe_ids=ids,
+            is_fixed=is_fixed,
+            Ts_world_body=Ts,
+            scales=scales,
+            landmark_ids=landmark_ids,
+            points_world=points,
+            obs_keyframe=position[used],
+            obs_landmark=index[used],
+            obs_keypoint=keypoints[used],
+            anchor_id=int(ids[is_fixed][0]) if is_fixed.any() else int(ids[0]),
+            version=version,
+            epoch=epoch,
+        )
 
     def apply(self, update: Update) -> None:
         """Write a solution into the map as it is now (rules: `odomap.maps.snapshot`).
@@ -192,6 +230,6 @@ class Map(Surroundings):
     def _drop_observations_of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Remove all observations of keyframes, and return the slots of what they saw."""
         _, rows = self._observations.of_keyframes(keyframes)
-        slots = self._observations.columns(rows)[1]
+        slots = self._observations.read(rows)[1]
         self._observations.remove(rows)
         return slots

@@ -15,13 +15,14 @@ Landmarks are named by slot here (`Landmarks.slots`); `Map` speaks in ids.
 Reference: H. Strasdat et al., Double window optimisation for constant time visual SLAM, 2011.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import distinct, grown
+from odomap.maps.column import Column
+from odomap.maps.columns import distinct
 from odomap.maps.ragged import Ragged
 
 __all__ = ["Observations"]
@@ -31,11 +32,10 @@ class Observations:
     """The table (keyframe, landmark, keypoint)."""
 
     def __init__(self) -> None:
-        self._keyframe = np.zeros(0, np.int32)
-        self._landmark = np.zeros(0, np.int32)
-        self._keypoint = np.zeros(0, np.int32)
-        self._alive = np.zeros(0, np.bool_)
-        self._mark = np.zeros(0, np.int32)
+        self._keyframe = Column[np.int32].empty(np.int32)
+        self._landmark = Column[np.int32].empty(np.int32)
+        self._keypoint = Column[np.int32].empty(np.int32)
+        self._alive = Column[np.bool_].empty(np.bool_)
         self._by_keyframe = Ragged()
         self._by_landmark = Ragged()
         self._free: list[int] = []
@@ -43,6 +43,20 @@ class Observations:
 
     def __len__(self) -> int:
         return self._end - len(self._free)
+
+    def columns(self) -> tuple[Column[Any], ...]:
+        """Return the columns that `twin` needs copies of."""
+        own = self._keyframe, self._landmark, self._keypoint
+        return (*own, *self._by_keyframe.columns(), *self._by_landmark.columns())
+
+    def twin(self, copies: Iterator[Column[Any]]) -> "Observations":
+        """Return the same table, to be read only, made of copies of `columns`."""
+        twin = Observations()
+        twin._keyframe, twin._landmark, twin._keypoint = next(copies), next(copies), next(copies)
+        twin._by_keyframe = self._by_keyframe.twin(copies)
+        twin._by_landmark = self._by_landmark.twin(copies)
+        twin._end = self._end
+        return twin
 
     def dump(self, keyframes: int) -> dict[str, NDArray[Any]]:
         """Return copies of all rows, in the order in which each keyframe has its own.
@@ -68,14 +82,13 @@ class Observations:
 
     def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill an empty table with what `dump` returned."""
-        self._keyframe, self._landmark = columns["keyframe"].copy(), columns["landmark"].copy()
-        self._keypoint, self._end = columns["keypoint"].copy(), len(columns["keypoint"])
-        self._alive = np.ones(self._end, np.bool_)
-        rows, others = np.arange(self._end, dtype=np.int32), columns["by_landmark"]
-        self._by_keyframe.append(self._keyframe.astype(np.int64), rows)
-        self._by_landmark.append(self._landmark[others].astype(np.int64), others)
+        rows, others = self._new_rows(len(columns["keypoint"])), columns["by_landmark"]
+        self._keyframe[rows], self._landmark[rows] = columns["keyframe"], columns["landmark"]
+        self._keypoint[rows], self._alive[rows] = columns["keypoint"], True
+        self._by_keyframe.append(columns["keyframe"].astype(np.int64), rows.astype(np.int32))
+        self._by_landmark.append(columns["landmark"][others].astype(np.int64), others)
 
-    def columns(
+    def read(
         self, rows: NDArray[np.int64] | NDArray[np.int32]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Return the (N,) keyframes, landmark slots and keypoints of (N,) rows."""
@@ -84,10 +97,6 @@ class Observations:
             self._landmark[rows].astype(np.int64),
             self._keypoint[rows].astype(np.int64),
         )
-
-    def rows(self) -> NDArray[np.int64]:
-        """Return all living rows in order."""
-        return np.flatnonzero(self._alive[: self._end])
 
     def of_keyframes(
         self, keyframes: NDArray[np.int64]
@@ -137,15 +146,6 @@ class Observations:
         order = np.argsort(-counts[ids], kind="stable")
         return ids[order], counts[ids[order]]
 
-    def positions(self, landmarks: NDArray[np.int64], of: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return where each of (N,) slots stands in the (M,) distinct slots `of`, -1 if nowhere."""
-        highest = max(int(landmarks.max(initial=-1)), int(of.max(initial=-1)))
-        self._mark = grown(self._mark, highest + 1, fill=-1)
-        self._mark[of] = np.arange(len(of), dtype=np.int32)
-        where = self._mark.take(landmarks).astype(np.int64)
-        self._mark[of] = -1
-        return where
-
     def add(self, keyframe: int, landmarks: NDArray[np.int64], keypoints: NDArray[np.int64]) -> int:
         """Add the observations of one keyframe; a pair already there takes the new keypoint.
 
@@ -177,8 +177,8 @@ class Observations:
         """Remove (N,) living rows."""
         gone = distinct(rows.astype(np.int64))
         self._alive[gone] = False
-        self._by_keyframe.keep(distinct(self._keyframe[gone]).astype(np.int64), self._alive)
-        self._by_landmark.keep(distinct(self._landmark[gone]).astype(np.int64), self._alive)
+        self._by_keyframe.keep(distinct(self._keyframe[gone]).astype(np.int64), self._alive.values)
+        self._by_landmark.keep(distinct(self._landmark[gone]).astype(np.int64), self._alive.values)
         self._free.extend(gone.tolist())
 
     def reassign(self, gone: NDArray[np.int64], survivors: NDArray[np.int64]) -> None:
@@ -205,8 +205,8 @@ class Observations:
         del self._free[cut:]
         fresh = self._end + np.arange(number - len(reused), dtype=np.int64)
         self._end += len(fresh)
-        self._keyframe = grown(self._keyframe, self._end)
-        self._landmark = grown(self._landmark, self._end)
-        self._keypoint = grown(self._keypoint, self._end)
-        self._alive = grown(self._alive, self._end)
+        self._keyframe.reserve(self._end)
+        self._landmark.reserve(self._end)
+        self._keypoint.reserve(self._end)
+        self._alive.reserve(self._end)
         return np.concatenate([np.asarray(reused, np.int64), fresh])

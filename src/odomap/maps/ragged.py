@@ -9,10 +9,14 @@ Appending n values and reading the lists of some owners (`gather`, a CSR view) c
 touched), whatever the size of the map; memory is at most twice the values, and is used again.
 """
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.columns import distinct, grown, offsets, spans
+from odomap.maps.column import Column
+from odomap.maps.columns import distinct, offsets, spans
 
 __all__ = ["Ragged"]
 
@@ -23,12 +27,23 @@ class Ragged:
     """Lists of int32 values by owner 0, 1, 2, ...; an owner never seen has an empty list."""
 
     def __init__(self) -> None:
-        self._start = np.zeros(0, np.int64)
-        self._count = np.zeros(0, np.int64)
-        self._capacity = np.zeros(0, np.int64)
-        self._values = np.zeros(0, np.int32)
+        self._start = Column[np.int64].empty(np.int64)
+        self._count = Column[np.int64].empty(np.int64)
+        self._capacity = Column[np.int64].empty(np.int64)
+        self._values = Column[np.int32].empty(np.int32)
         self._end = 0
         self._free: dict[int, list[int]] = {}
+
+    def columns(self) -> tuple[Column[Any], ...]:
+        """Return the columns that `twin` needs copies of."""
+        return self._start, self._count, self._values
+
+    def twin(self, copies: Iterator[Column[Any]]) -> "Ragged":
+        """Return the same lists, to be read only, made of copies of `columns`."""
+        twin = Ragged()
+        twin._start, twin._count, twin._values = next(copies), next(copies), next(copies)
+        twin._capacity.reserve(len(twin._start))
+        return twin
 
     def counts(self, owners: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the (N,) lengths of the lists of (N,) owners."""
@@ -45,8 +60,8 @@ class Ragged:
             indptr (N + 1,) and values: the list of owners[n] is values[indptr[n]:indptr[n + 1]].
         """
         self._cover(owners)
-        counts = self._count[owners]
-        return offsets(counts), self._values[spans(self._start[owners], counts)]
+        counts = self._count.take(owners)
+        return offsets(counts), self._values.take(spans(self._start.take(owners), counts))
 
     def append(self, owners: NDArray[np.int64], values: NDArray[np.int32]) -> None:
         """Append values[n] to the list of owners[n]; (N,) each, owners may repeat."""
@@ -84,9 +99,9 @@ class Ragged:
     def _cover(self, owners: NDArray[np.int64]) -> None:
         rows = int(owners.max()) + 1 if len(owners) else 0
         if rows > len(self._start):
-            self._start = grown(self._start, rows)
-            self._count = grown(self._count, rows)
-            self._capacity = grown(self._capacity, rows)
+            self._start.reserve(rows)
+            self._count.reserve(rows)
+            self._capacity.reserve(rows)
 
     def _reserve(self, owners: NDArray[np.int64], added: NDArray[np.int64]) -> None:
         """Make room for so many more values; distinct owners."""
@@ -114,7 +129,7 @@ class Ragged:
         del free[cut:]
         fresh = self._end + size * np.arange(number - len(reused), dtype=np.int64)
         self._end += size * len(fresh)
-        self._values = grown(self._values, self._end)
+        self._values.reserve(self._end)
         return np.concatenate([np.asarray(reused, np.int64), fresh])
 
     def _release(self, owners: NDArray[np.int64]) -> None:

@@ -153,13 +153,13 @@ class Sightings(Skeleton):
     def landmark_ids(self) -> NDArray[np.int64]:
         """(M,) ids of living landmarks, ascending."""
         with self.lock:
-            return np.sort(self._landmarks.ids[self._landmarks.all_slots()])
+            return self._landmarks.all_ids()
 
     def count_seen(self, landmark_ids: ArrayLike) -> None:
         """Count one more frame in which landmarks were seen; those gone are passed over."""
         with self.lock:
             slots = self._landmarks.slots(self._ids(landmark_ids))
-            np.add.at(self._landmarks.seen, slots[slots >= 0], 1)
+            self._landmarks.seen.add(slots[slots >= 0], 1)
             self.version += 1
 
     def seen(self, landmark_ids: ArrayLike) -> NDArray[np.int64]:
@@ -171,7 +171,7 @@ class Sightings(Skeleton):
         """Count one more frame in which landmarks should have been seen; passes over those gone."""
         with self.lock:
             slots = self._landmarks.slots(self._ids(landmark_ids))
-            np.add.at(self._landmarks.expected, slots[slots >= 0], 1)
+            self._landmarks.expected.add(slots[slots >= 0], 1)
             self.version += 1
 
     def expected(self, landmark_ids: ArrayLike) -> NDArray[np.int64]:
@@ -218,7 +218,7 @@ class Sightings(Skeleton):
         """Return the (n,) landmark ids that a keyframe sees, and at which of its keypoints."""
         with self.lock:
             _, rows = self._observations.of_keyframes(np.array([self._known(keyframe_id)]))
-            _, slots, keypoints = self._observations.columns(rows)
+            _, slots, keypoints = self._observations.read(rows)
             return self._landmarks.ids[slots], keypoints
 
     def observers_of(
@@ -235,7 +235,7 @@ class Sightings(Skeleton):
         """
         with self.lock:
             indptr, rows = self._observations.of_landmarks(self._living_slots(landmark_ids))
-            keyframes, _, keypoints = self._observations.columns(rows)
+            keyframes, _, keypoints = self._observations.read(rows)
             return indptr, keyframes, keypoints
 
     def count_observers(self, landmark_ids: ArrayLike) -> NDArray[np.int64]:
@@ -260,7 +260,7 @@ class Sightings(Skeleton):
 
     def _points(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
         anchors = self._landmarks.anchor.take(slots).astype(np.int64)
-        return act(self.states.placements(anchors), self._landmarks.p_anchor.take(slots, axis=0))
+        return act(self.states.placements(anchors), self._landmarks.p_anchor.take(slots))
 
 
 def _root(heir: dict[int, int], slot: int) -> int:

@@ -191,7 +191,8 @@ class Skeleton:
     def edges(self) -> EdgeTable:
         """Return all edges, copied."""
         with self.lock:
-            return self._edges.table()
+            twin = self._edges.twin()
+        return twin.table()
 
     @staticmethod
     def _ids(ids: ArrayLike) -> NDArray[np.int64]:

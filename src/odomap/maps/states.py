@@ -119,6 +119,12 @@ class States:
         """(K, 6, 6) covariances, a view that may be written."""
         return self._covariances[: self._rows]
 
+    def twin(self) -> "States":
+        """Return the same table, copied."""
+        twin = States()
+        twin.restore({name: getattr(self, name) for name in _COLUMNS})
+        return twin
+
     def dump(self) -> dict[str, NDArray[Any]]:
         """Return copies of all columns."""
         return {name: getattr(self, name).copy() for name in _COLUMNS}

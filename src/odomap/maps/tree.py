@@ -65,11 +65,25 @@ class Tree:
 
     def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill an empty tree with what `dump` returned."""
-        self.status = columns["status"].copy()
-        self.parent = columns["parent"].copy()
-        self.created = columns["created"].copy()
-        self._Ts_parent_self = columns["Ts_parent_self"].copy()
-        self._scales_parent_self = columns["scales_parent_self"].copy()
+        rows = len(columns["status"])
+        self.status = grown(self.status, rows)
+        self.parent = grown(self.parent, rows, fill=-1)
+        self.created = grown(self.created, rows)
+        self._Ts_parent_self = grown(self._Ts_parent_self, rows)
+        self._scales_parent_self = grown(self._scales_parent_self, rows)
+        self.status[:rows], self.parent[:rows] = columns["status"], columns["parent"]
+        self.created[:rows] = columns["created"]
+        self._Ts_parent_self[:rows] = columns["Ts_parent_self"]
+        self._scales_parent_self[:rows] = columns["scales_parent_self"]
+
+    def twin(self) -> "Tree":
+        """Return the same tree, copied."""
+        twin = Tree()
+        twin.status, twin.parent = self.status.copy(), self.parent.copy()
+        twin.created = self.created.copy()
+        twin._Ts_parent_self = self._Ts_parent_self.copy()
+        twin._scales_parent_self = self._scales_parent_self.copy()
+        return twin
 
     def status_of(self, keyframe: int) -> int:
         """Return ABSENT, ALIVE or STUB; ids never given are absent."""

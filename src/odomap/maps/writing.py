@@ -102,5 +102,5 @@ def drop_observations(observations: Observations, landmarks: Landmarks, update: 
     there = rows >= 0
     if update.dropped_keypoints is not None:
         keypoints = np.asarray(update.dropped_keypoints, np.int64)[known]
-        there[there] = observations.columns(rows[there])[2] == keypoints[there]
+        there[there] = observations.read(rows[there])[2] == keypoints[there]
     observations.remove(rows[there])
