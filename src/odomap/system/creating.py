@@ -28,7 +28,7 @@ from odomap.geometry.lie import se3_inverse
 from odomap.limits import Count, Limits, NotNegative, check_limits
 from odomap.system.creating_kernels import agree, judge
 from odomap.system.localwindow import LocalWindow
-from odomap.vision.matching import MatchConfig, match_epipolar
+from odomap.vision.matching import EpipolarView, MatchConfig, match_epipolar
 
 __all__ = ["CreateConfig", "Created", "create_landmarks"]
 
@@ -164,7 +164,7 @@ def _match(window: LocalWindow, neighbours: list[int], matching: MatchConfig) ->
     T_newest_world = se3_inverse(window.Ts_world_camera[n])
     for k in neighbours:
         T = np.ascontiguousarray(se3_inverse(T_newest_world @ window.Ts_world_camera[k]))
-        found = match_epipolar(*first, *_free(window, k), T, sigma, window.level_scale, matching)
+        found = match_epipolar(first, _free(window, k), T, sigma, window.level_scale, matching)
         rows.append(np.stack([found[:, 0], np.full(len(found), k), found[:, 1]], axis=1))
     all_rows = np.concatenate(rows)
     order = np.argsort(all_rows[:, 0], kind="stable")
@@ -172,12 +172,11 @@ def _match(window: LocalWindow, neighbours: list[int], matching: MatchConfig) ->
     return _Pairs(keypoint, neighbour, other)
 
 
-def _free(
-    window: LocalWindow, k: int
-) -> tuple[NDArray[np.uint8], Array, NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return descriptors, bearings and levels of keyframe k, and which have no landmark."""
+def _free(window: LocalWindow, k: int) -> EpipolarView:
+    """Return the keypoints of keyframe k that have no landmark, for matching."""
     features = window.features(k)
-    return features.descriptors, features.bearings, features.level, window.landmark_at(k) < 0
+    usable = window.landmark_at(k) < 0
+    return EpipolarView(features.descriptors, features.bearings, features.level, usable)
 
 
 def _views(window: LocalWindow) -> tuple[Array, Array]:
