@@ -18,6 +18,7 @@ from odomap.files.mapfile import save_map
 from odomap.files.trajectories import write_tum
 from odomap.logbook import Logbook
 from odomap.maps.estimate import Estimate, Status
+from odomap.savedmap import map_settings
 from odomap.sensors.sync import format_stamp
 from odomap.settings import config_to_yaml
 from odomap.version import __version__
@@ -52,6 +53,9 @@ REPORTED = (
 )
 """Metrics that the report shows."""
 
+OF_THE_MAP = ("keyframes.tum", "map.odomap")
+"""What is not written where frames are only placed in a map."""
+
 FLUSH_EVERY = 25
 """Frames after which the live path is handed to the operating system."""
 
@@ -77,6 +81,8 @@ class Outputs:
         self.written: tuple[str, ...] = ()
         self._config = config_to_yaml(config, {"odomap": __version__} | dict(head))
         self._data = str(head.get("data", ""))
+        self._settings, self._map = map_settings(config), str(head.get("map", ""))
+        self._is_mapping = bool(head.get("is_mapping", True))
         self._part = self.folder / "trajectory_live.tum.part"
         self._live: TextIO | None = None
         self._lines = 0
@@ -131,6 +137,8 @@ class Outputs:
                 ),
             ),
         ]
+        if not self._is_mapping:
+            jobs = [job for job in jobs if job[0] not in OF_THE_MAP]
         for name, job in jobs:
             try:
                 job()
@@ -146,9 +154,15 @@ class Outputs:
     def _at(self, name: str) -> Path:
         return self.folder / name
 
+    def _command(self) -> str:
+        """Return the command that does it again."""
+        verb = "continue" if self._is_mapping else "localize"
+        head = f"odomap {verb} {self._map}" if self._map else "odomap run"
+        return f"{head} {self._data} --config {self.folder / 'config.yaml'}"
+
     def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
         file = self._at("map.odomap")
-        save_map(file, result.map, source.rig)
+        save_map(file, result.map, source.rig, settings=self._settings)
         metrics["map_bytes"] = file.stat().st_size
 
     def _report(
@@ -177,7 +191,7 @@ class Outputs:
             title=source.name,
             source=self._data,
             version=__version__,
-            command=f"odomap run {self._data} --config {self.folder / 'config.yaml'}",
+            command=self._command(),
             config=self._config,
             rig=rig_text(source),
             estimates=logbook.estimates,

@@ -22,19 +22,21 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from odomap.errors import CalibrationError, InputError
+from odomap.figures import figures
 from odomap.geometry.trajectory import Trajectory
-from odomap.logbook import Logbook, skipped_numbers, versions
-from odomap.maps.estimate import Estimate, Status
+from odomap.logbook import Logbook
+from odomap.maps.estimate import Estimate
 from odomap.settings import override, read_config
 
 if TYPE_CHECKING:
     from odomap.maps.map import Map
     from odomap.outputs import Outputs
+    from odomap.savedmap import SavedMap
     from odomap.sensors.frame import Frame
     from odomap.sensors.rig import Rig
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.odometry import Odometry, Result
+    from odomap.system.visual import Result, VisualSystem
     from odomap.system.worker import Worker
     from odomap.viewing import View
 
@@ -113,6 +115,8 @@ def run(
     progress: Callable[[Progress], None] | None = None,
     origin: Mapping[str, object] | None = None,
     view: "View | bool" = False,
+    map: "SavedMap | Map | str | Path | None" = None,
+    is_mapping: bool = True,
 ) -> RunResult:
     """Track a recording from end to end, and write its results.
 
@@ -129,6 +133,8 @@ def run(
         progress: called with a `Progress` as the run goes on.
         origin: extra keys for the head of config.yaml.
         view: True shows the run in the browser while it lasts; a `View` stays open.
+        map: a map, or a file of one, to begin with; default a new one.
+        is_mapping: False only places frames in the map, which stays as it is.
 
     Returns:
         Trajectories, map, metrics; `failure` says why there is no usable path.
@@ -145,6 +151,7 @@ def run(
         0
     """
     from odomap.outputs import Outputs
+    from odomap.savedmap import SavedMap
     from odomap.sources.source import Source
     from odomap.system.rhythms import check_rhythm
     from odomap.system.worker import deferred_interrupt
@@ -156,15 +163,20 @@ def run(
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
     chosen_config(preset, config)  # a wrong name is told before anything is opened
     source = data if isinstance(data, Source) else _opened(data, rig)
-    settings = chosen_config(preset, config, rig=source.rig)
+    saved = None if map is None else SavedMap.of(map)
+    usual = None if saved is None else saved.sensors or None
+    settings = chosen_config(preset or usual, config, rig=source.rig)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
     head |= ({"preset": preset} if preset else {}) | dict(origin or {}) | {"rhythm": rhythm}
+    if saved is not None:
+        saved.check(source.rig, settings)
+        head |= {"map": saved.name, "is_mapping": is_mapping}
     outputs = Outputs(out, settings, head) if out is not None else None
 
     tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
-    system = _system(source, settings, rhythm, head)
+    system = _system(source, settings, rhythm, head, saved, is_mapping)
     shown = watching(view, system, source.rig, settings)
     with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
@@ -173,7 +185,7 @@ def run(
             raise CalibrationError(f"{head['data']}: {error}") from error
         result = system.finish()
         state: dict[str, object] = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
-        state |= {"rhythm": rhythm} | _dropped(system.worker)
+        state |= {"rhythm": rhythm, "is_mapping": is_mapping} | _dropped(system.worker)
         if broken is not None:
             state["failure"] = f"tracking stopped: {broken}"
         finished = _concluded(source, logbook, result, outputs, state, tell)
@@ -239,8 +251,13 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
 
 
 def _system(
-    source: "Source", settings: "Config", rhythm: str, head: Mapping[str, object]
-) -> "Odometry":
+    source: "Source",
+    settings: "Config",
+    rhythm: str,
+    head: Mapping[str, object],
+    saved: "SavedMap | None",
+    is_mapping: bool,
+) -> "VisualSystem":
     import cv2
 
     from odomap.system.odometry import make_odometry
@@ -248,6 +265,10 @@ def _system(
     # The stages use the cores themselves; OpenCV's own threads would only get in their way.
     cv2.setNumThreads(1)
     try:
+        if saved is not None:
+            from odomap.system.slam import Slam
+
+            return Slam(source.rig, settings, rhythm, saved.map, is_mapping)
         return make_odometry(source.rig, settings, rhythm)
     except CalibrationError as error:
         raise CalibrationError(f"{head['data']}: {error}") from error
@@ -255,7 +276,7 @@ def _system(
 
 def _track(
     source: "Source",
-    system: "Odometry",
+    system: "VisualSystem",
     logbook: Logbook,
     outputs: "Outputs | None",
     max_frames: int | None,
@@ -316,7 +337,7 @@ def _concluded(
     tell: Callable[[Progress], None],
 ) -> RunResult:
     """Make the numbers, write what is asked for."""
-    metrics, warnings = _metrics(source, logbook, result)
+    metrics, warnings = figures(source, logbook, result, bool(state["is_mapping"]))
     metrics |= state
     if metrics["frames_dropped"]:
         came = metrics["frames"] + metrics["frames_dropped"]
@@ -336,54 +357,6 @@ def _concluded(
         failure=metrics["failure"],
         warnings=tuple(warnings),
     )
-
-
-def _metrics(
-    source: "Source", logbook: Logbook, result: "Result"
-) -> tuple[dict[str, Any], list[str]]:
-    """Return the content of metrics.json and the warnings."""
-    from odomap.evaluation.metrics import ate
-
-    warnings = list(getattr(source, "notes", []))
-    metrics: dict[str, Any] = {"name": source.name} | logbook.numbers() | skipped_numbers(source)
-    # Frames that were placed later have a pose now.
-    placed = set(result.trajectory.stamps_ns.tolist())
-    lost = [e for e in logbook.estimates if e.status == Status.LOST and e.stamp_ns not in placed]
-    metrics["tracked"], metrics["lost"] = len(placed), len(lost)
-    metrics["is_metric"] = result.is_metric
-    metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
-    metrics["keyframes"] = len(result.keyframes)
-    metrics["landmarks"] = result.map.num_landmarks
-    metrics["loops"] = 0
-    metrics["failure"] = logbook.failure(len(placed))
-    metrics["ate_rmse_m"] = None
-    metrics["ate"] = None
-    if source.truth is not None:
-        try:
-            truth = result.truth(source.truth)
-            found = ate(result.trajectory, truth, "se3" if result.is_metric else "sim3")
-        except InputError as error:
-            warnings.append(f"no comparison with the ground truth: {error}")
-        else:
-            metrics["ate_rmse_m"] = found.rmse
-            metrics["ate"] = found.as_dict()
-    if not result.is_metric:
-        warnings.append("one camera cannot tell the scale: lengths are in units of their own")
-    anew = [e for e in logbook.estimates if e.is_keyframe and e.status == Status.INITIALIZING]
-    if anew:
-        times = "once" if len(anew) == 1 else f"{len(anew)} times"
-        warnings.append(f"tracking {anew[0].reason} (frame {anew[0].frame_id}, {times} in all)")
-    if metrics["skipped"]:
-        first, count = source.skipped[0], metrics["skipped"]
-        what = "1 measurement" if count == 1 else f"{count} measurements, the first"
-        warnings.append(f"skipped {what}: {first.file}: {first.reason}")
-    for frame_id, seconds in logbook.gaps():
-        warnings.append(f"a gap of {seconds:.2f} s after frame {frame_id}")
-    if lost and not metrics["failure"]:
-        warnings.append(f"{len(lost)} of {metrics['frames']} frames lost: {lost[0].reason}")
-    metrics["warnings"] = warnings
-    metrics["versions"] = versions()
-    return metrics, warnings
 
 
 class _CallableModule(ModuleType):

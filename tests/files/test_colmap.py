@@ -4,12 +4,17 @@ import numpy as np
 import pytest
 
 from mapworlds import rich_map
+from odomap.cli import main
 from odomap.errors import InputError, OutputError
 from odomap.files.colmap import write_colmap
+from odomap.files.mapfile import save_map
+from odomap.files.rig import write_rig
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import rotation_from_quaternion, se3_exp, se3_inverse
+from odomap.geometry.pose import SE3
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.sensors.rig import CameraMount, Rig
 from odomap.vision.features import Features
 
 CAMERA = Camera(intrinsics=(410.5, 408.25, 319.5, 241.0), resolution=(640, 480))
@@ -141,3 +146,28 @@ def test_what_cannot_be_written_is_said(tmp_path):
         write_colmap(tmp_path, simulated(), lens, T_BODY_CAMERA)
     with pytest.raises(OutputError, match="nowhere"):
         write_colmap(tmp_path / "nowhere", simulated(), CAMERA, T_BODY_CAMERA)
+
+
+def a_rig():
+    return Rig(cameras=(CameraMount("cam", CAMERA, SE3(T_BODY_CAMERA)),), body="")
+
+
+def test_the_command_line_takes_the_camera_from_the_map(tmp_path, capsys):
+    """A single camera is the body, so the images are at the keyframes; --rig replaces the rig."""
+    m = simulated()
+    save_map(tmp_path / "map.odomap", m, a_rig(), settings={"sensors": "mono"})
+    assert main(["export", str(tmp_path), "--colmap", str(tmp_path / "new" / "model")]) == 0
+    assert "6 images, 40 points, seen 225 times" in capsys.readouterr().out
+    cameras, images, _ = read(tmp_path / "new" / "model")
+    assert cameras[1][1:] == (640, 480, 410.5, 408.25, 320.0, 241.5)
+    np.testing.assert_allclose(images[3][0], se3_inverse(m.T_world_body(2)), atol=1e-12)
+
+
+def test_maps_that_do_not_say_their_cameras_are_given_them(tmp_path, capsys):
+    save_map(tmp_path / "map.odomap", simulated())
+    words = ["export", str(tmp_path / "map.odomap"), "--colmap", str(tmp_path / "model")]
+    assert main(words) == 2
+    assert "does not say which cameras it was made with" in capsys.readouterr().err
+    write_rig(tmp_path / "rig.yaml", a_rig())
+    assert main([*words, "--rig", str(tmp_path / "rig.yaml")]) == 0
+    assert len(read(tmp_path / "model")[1]) == 6

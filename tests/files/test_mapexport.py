@@ -12,7 +12,7 @@ from odomap.errors import InputError
 from odomap.files.clouds import read_ply
 from odomap.files.g2o import read_g2o
 from odomap.files.mapexport import keyframe_trajectory, map_graph, write_map_parts
-from odomap.files.mapfile import save_map
+from odomap.files.mapfile import VERSION, save_map
 from odomap.files.trajectories import read_tum
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
@@ -126,7 +126,7 @@ def test_info_says_what_is_inside(tmp_path, capsys):
     assert main(["info", str(file), "--check"]) == 0
     text = capsys.readouterr().out
     for part in (
-        "map.odomap (odomap map, version 1)",
+        f"map.odomap (odomap map, version {VERSION})",
         "6, and 2 culled ones",
         f"{m.num_landmarks}, seen {m.num_observations} times",
         "features of 4, scan of 2, cloud of 3, imu of 4",

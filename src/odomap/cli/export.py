@@ -1,14 +1,17 @@
 """`odomap export`: a coloured cloud and a mesh of what a run saw; landmarks and poses of a map."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from odomap.cli.progress import Steps
 from odomap.errors import InputError
+
+if TYPE_CHECKING:
+    from odomap.savedmap import SavedMap
 
 __all__ = ["Export"]
 
@@ -18,8 +21,8 @@ class Export:
     """Make a coloured cloud and a mesh of a run with depth or stereo; write parts of a map file.
 
     Cloud and mesh are re-made from the run's keyframes, for which its recording is opened again.
-    Without options both are written into the run's folder. --points, --trajectory and --graph take
-    what the map holds, and need no recording.
+    Without options both are written into the run's folder. --points, --trajectory, --graph and
+    --colmap take what the map holds, and need no recording.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|MAP")]
@@ -30,6 +33,8 @@ class Export:
     """TUM file for the keyframes of the map."""
     graph: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """g2o file for the keyframes of the map and the edges between them."""
+    colmap: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder for the map as COLMAP text: cameras.txt, images.txt, points3D.txt."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """PLY file for the coloured points."""
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -41,7 +46,7 @@ class Export:
     data: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
     """The recording, if it is no longer where the run found it."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A rig.yaml, if it is no longer where the run found it."""
+    """A rig.yaml, if it is no longer where the run found it, or a map does not say one."""
     picture: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Do not draw the mesh."""
     quiet: bool = False
@@ -54,36 +59,48 @@ class Export:
             "--trajectory": (self.trajectory, (".tum", ".txt", ".gz")),
             "--graph": (self.graph, (".g2o", ".gz")),
         }
-        if any(file is not None for file, _ in of_map.values()):
+        if self.colmap is not None or any(file is not None for file, _ in of_map.values()):
             self._write_map(of_map)
             if self.cloud is None and self.mesh is None:
                 return 0
         elif self.run.is_file():
             raise InputError(
-                f"{self.run}: say what of the map: --points, --trajectory or --graph FILE "
-                "(a cloud and a mesh are made of a run's folder)"
+                f"{self.run}: say what of the map: --points, --trajectory or --graph FILE, or "
+                "--colmap FOLDER (a cloud and a mesh are made of a run's folder)"
             )
         return self._make_surface()
 
     def _write_map(self, wanted: dict[str, tuple[Path | None, tuple[str, ...]]]) -> None:
         from odomap.files.atomic import make_folder
         from odomap.files.mapexport import write_map_parts
-        from odomap.files.mapfile import load_map
+        from odomap.savedmap import SavedMap, map_file
 
-        source = self.run / "map.odomap" if self.run.is_dir() else self.run
+        source = map_file(self.run)
         files = [file for file, _ in wanted.values() if file is not None]
         for option, (file, endings) in wanted.items():
             if file is not None and file.suffix.lower() not in endings:
                 raise InputError(f"{option} {file}: give a name that ends in {endings[0]}")
         if len({file.resolve() for file in [source, *files]}) < 1 + len(files):
             raise InputError("--points, --trajectory and --graph: give names of their own")
-        if self.run.is_dir() and not source.exists():
-            raise InputError(f"{self.run}: has no map.odomap: give a map file")
-        m = load_map(source)
+        saved = SavedMap.load(source)
         for file in files:
             make_folder(file.parent)
-        for line in write_map_parts(m, self.points, self.trajectory, self.graph):
+        for line in write_map_parts(saved.map, self.points, self.trajectory, self.graph):
             print(f"{'wrote':<16} {line}")
+        if self.colmap is not None:
+            self._write_colmap(saved, self.colmap)
+
+    def _write_colmap(self, saved: "SavedMap", folder: Path) -> None:
+        from odomap.files.atomic import make_folder
+        from odomap.files.colmap import write_colmap
+        from odomap.files.rig import read_rig
+
+        if self.rig is not None:
+            saved = replace(saved, rig=read_rig(self.rig))
+        eye = saved.eye()
+        model = write_colmap(make_folder(folder), saved.map, eye.camera, eye.T_body_camera)
+        counts = f"{len(model.keyframes)} images, {len(model.point_ids)} points"
+        print(f"{'wrote':<16} {folder}: {counts}, seen {len(model.obs_image)} times")
 
     def _make_surface(self) -> int:
         from odomap.export import export

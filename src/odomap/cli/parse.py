@@ -19,8 +19,10 @@ from odomap.cli.doctor import Doctor
 from odomap.cli.evaluate import Evaluate
 from odomap.cli.export import Export
 from odomap.cli.info import Info
+from odomap.cli.localize import Continue, Localize
 from odomap.cli.optimize import Optimize
 from odomap.cli.run import Run
+from odomap.cli.view import ViewVerb
 from odomap.errors import InputError, nearest_name
 from odomap.version import __version__
 
@@ -28,6 +30,8 @@ __all__ = ["Verb", "parse"]
 
 VERBS: dict[str, Any] = {
     "run": Run,
+    "localize": Localize,
+    "continue": Continue,
     "demo": Demo,
     "calibrate": Calibrate,
     "eval": Evaluate,
@@ -35,11 +39,12 @@ VERBS: dict[str, Any] = {
     "bundle": Bundle,
     "export": Export,
     "info": Info,
+    "view": ViewVerb,
     "config": ConfigVerb,
     "doctor": Doctor,
 }
 
-TAKES_OVERRIDES = frozenset({"run", "demo", "config"})
+TAKES_OVERRIDES = frozenset({"run", "localize", "continue", "demo", "config"})
 """Verbs that accept --section.field VALUE for any field of the config."""
 
 DESCRIPTION = """SLAM in Python.

@@ -12,6 +12,7 @@ from odomap.cli.progress import TrackingProgress
 
 if TYPE_CHECKING:
     from odomap.run import RunResult
+    from odomap.savedmap import SavedMap
     from odomap.system.config import Config
     from odomap.viewing import View
 
@@ -24,8 +25,8 @@ Overrides = Annotated[tuple[tuple[str, str], ...], tyro.conf.Suppress]
 class Run:
     """Track a recording; write its path, map, numbers and a report.
 
-    Writes trajectory.tum, trajectory_live.tum, metrics.json, config.yaml and report.html. Any field
-    that `odomap config` prints can be set as --section.field VALUE.
+    Writes trajectory.tum, trajectory_live.tum, keyframes.tum, map.odomap, metrics.json, config.yaml
+    and report.html. Any field that `odomap config` prints can be set as --section.field VALUE.
     """
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
@@ -98,6 +99,8 @@ def track(
     quiet: bool,
     rhythm: str = "lockstep",
     view: "View | None" = None,
+    map: "SavedMap | None" = None,
+    is_mapping: bool = True,
 ) -> "tuple[int, RunResult]":
     """Run with progress, print the conclusion, and return the exit code with the result."""
     from odomap.run import Interrupted, run
@@ -114,6 +117,8 @@ def track(
                 progress=progress.show,
                 origin=origin,
                 view=view or False,
+                map=map,
+                is_mapping=is_mapping,
             )
     except Interrupted as stop:
         result, code = stop.result, 130
@@ -141,7 +146,8 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
     """Return the lines of the conclusion, name and value."""
     m = result.metrics
     ms = m["ms_per_frame"]
-    counts = [f"{m['tracked']} tracked", f"{m['lost']} lost"]
+    placed = "tracked" if m["is_mapping"] else "localised"
+    counts = [f"{m['tracked']} {placed}", f"{m['lost']} lost"]
     if m["frames_dropped"]:
         counts.append(f"{m['frames_dropped']} dropped")
     if m["skipped"]:

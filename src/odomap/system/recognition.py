@@ -28,7 +28,7 @@ from odomap.geometry.lie import se3_inverse
 from odomap.geometry.pnp import PnpResult, refine_pose, solve_pnp
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.vision.matching import MatchConfig, match_all, match_guided
+from odomap.vision.matching import MatchConfig, match_guided, nearest
 
 __all__ = ["MOST", "Recognised", "Recognizer", "describes_places"]
 
@@ -36,9 +36,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
 
-MOST = 200
+MOST = 100
 """Keyframes compared per call."""
-VOTERS = 400
+VOTERS = 250
 """Features of the view that vote for keyframes; all are matched with the candidates."""
 CANDIDATES = 4
 """Keyframes that a pose is looked for with."""
@@ -155,8 +155,8 @@ class Recognizer:
             return "no keyframe of the map has landmarks with descriptors"
         step = -(-len(descriptors) // VOTERS)
         voters = np.ascontiguousarray(descriptors[::step])
-        votes = [len(self._pairs(voters, place)[0]) for place in places]
-        best, reason = -1, ""
+        votes = [self._votes(voters, place) for place in places]
+        best, reason = 0, "nothing of the map looks like this"
         for row in np.argsort(-np.asarray(votes), kind="stable")[:CANDIDATES].tolist():
             found = self._locate(view, places[row], seed)
             if isinstance(found, Recognised):
@@ -201,11 +201,22 @@ class Recognizer:
             return None
         return _Place(keyframe_id, ids, np.ascontiguousarray(features.descriptors[keypoints]))
 
+    def _votes(self, descriptors: Descriptors, place: _Place) -> int:
+        """Return how many features clearly look like something that a keyframe sees."""
+        _, distance, second = nearest(descriptors, place.descriptors)
+        return int(np.count_nonzero(self._is_clear(distance, second)))
+
     def _pairs(self, descriptors: Descriptors, place: _Place) -> tuple[Index, Index]:
-        """Return features (n,) and the landmarks (n,) they clearly look like."""
-        matches = match_all(descriptors, place.descriptors, self._matching)
-        rows = np.flatnonzero(matches >= 0)
-        return rows, place.landmark_ids[matches[rows]]
+        """Return features (n,) and the landmarks (n,) they clearly look like, and which do so."""
+        match, distance, second = nearest(descriptors, place.descriptors)
+        rows = np.flatnonzero(self._is_clear(distance, second))
+        looked_at, back = np.unique(match[rows], return_inverse=True)
+        mutual = nearest(place.descriptors[looked_at], descriptors)[0][back] == rows
+        return rows[mutual], place.landmark_ids[match[rows[mutual]]]
+
+    def _is_clear(self, distance: Index, second: Index) -> NDArray[np.bool_]:
+        limits = self._matching
+        return (distance <= limits.max_hamming) & (distance < limits.ratio * second)
 
     def _locate(self, view: _Sight, place: _Place, seed: int) -> Recognised | tuple[int, str]:
         """Find the pose from a candidate and its neighbours.
@@ -226,12 +237,11 @@ class Recognizer:
             min_inliers=FIRST_INLIERS,
         )
         if not start.converged:
-            return start.num_inliers, start.reason
+            return start.num_inliers, self._too_few(start.num_inliers)
         result, rows, ids = self._grown(view, group, start)
         rows, ids = rows[result.inliers], ids[result.inliers]
         if len(rows) < self._min_inliers:
-            why = f"{len(rows)} landmarks agree of {self._min_inliers} needed: another place?"
-            return len(rows), why
+            return len(rows), self._too_few(len(rows))
         share = _spread(view.keypoints[rows]) / (self._camera.width * self._camera.height)
         if not result.converged or share < SPREAD:
             why = result.reason or f"all that agrees is in {100 * share:.0f} % of the image"
@@ -239,6 +249,9 @@ class Recognizer:
         return Recognised(
             result.T_world_camera.matrix, result.covariance, ids, rows, _most_seen(group, ids)
         )
+
+    def _too_few(self, agreed: int) -> str:
+        return f"{agreed} landmarks agree of {self._min_inliers} needed: another place?"
 
     def _grown(
         self, view: _Sight, group: list[_Place], start: PnpResult

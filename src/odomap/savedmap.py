@@ -1,0 +1,176 @@
+"""Saved maps as places to start from: loaded, and compared with who wants to use them.
+
+A map knows places by landmarks with descriptors, in the pixels of one ideal camera. Frames of
+another camera, or of the same one looked through in another way, would be placed wrongly without a
+word, so a map is refused unless the cameras are those that it was made with. What made a map
+stands in its file: the rig, and as `sensors` which of its cameras were looked through.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from odomap.errors import InputError
+from odomap.files.mapfile import MapFile
+from odomap.maps.map import Map
+from odomap.sensors.rig import CameraMount, Rig
+
+if TYPE_CHECKING:
+    from odomap.system.config import Config
+    from odomap.system.eye import Eye
+
+__all__ = ["SavedMap", "map_file", "map_settings", "rig_differences"]
+
+KINDS = {"stereo": "a stereo pair", "rgbd": "a camera with depth", "mono": "one camera"}
+"""What `tracking.sensors` says, in words."""
+
+FILE = "map.odomap"
+"""Name of the map in the folder of a run."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """A map, and what is said about how it was made.
+
+    Attributes:
+        name: the file, for people.
+        map: what is remembered.
+        rig: the sensors it was made with; None where that is not said.
+        sensors: stereo, rgbd or mono; empty where that is not said.
+    """
+
+    name: str
+    map: Map
+    rig: Rig | None = None
+    sensors: str = ""
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SavedMap":
+        """Load a map file.
+
+        Args:
+            path: the file, or the folder of a run with one.
+
+        Raises:
+            InputError: it is not there, or broken.
+        """
+        with MapFile(map_file(path)) as file:
+            said = file.settings.get("sensors")
+            sensors = said if isinstance(said, str) and said in KINDS else ""
+            return cls(str(file.path), file.map(), file.rig, sensors)
+
+    @classmethod
+    def of(cls, map: "SavedMap | Map | str | Path") -> "SavedMap":
+        """Return what is known of a map, from a file, or as a program has it."""
+        if isinstance(map, SavedMap):
+            return map
+        return cls("map", map) if isinstance(map, Map) else cls.load(map)
+
+    def check(self, rig: Rig, config: "Config") -> None:
+        """Make sure that frames of a rig can be placed in the map.
+
+        Raises:
+            InputError: it holds no places, or was made with other cameras.
+        """
+        from odomap.system.recognition import describes_places
+
+        if not self.map.num_landmarks:
+            raise InputError(f"{self.name}: the map has no landmarks: nothing could be localised")
+        if not describes_places(self.map):
+            raise InputError(
+                f"{self.name}: none of its landmarks has a descriptor, so no place in it can be "
+                "recognised: make a map with `odomap run` without --odometry-only"
+            )
+        used = config.tracking.sensors
+        if self.sensors and self.sensors != used:
+            raise InputError(
+                f"{self.name}: was made with {KINDS[self.sensors]}, not with {KINDS[used]}: "
+                f"choose --preset {self.sensors}"
+            )
+        if self.rig is None:
+            return
+        for difference in rig_differences(self.rig, rig, used):
+            raise InputError(
+                f"{self.name}: was made with another rig: {difference}: give a recording of the "
+                "same cameras, or their calibration with --rig"
+            )
+
+    def eye(self) -> "Eye":
+        """Return the ideal camera whose pixels its features are in.
+
+        Raises:
+            InputError: the rig is not known.
+            CalibrationError: the rig does not carry what the map says.
+        """
+        from odomap.system.config import preset, preset_for
+        from odomap.system.visual import Sight
+
+        if self.rig is None:
+            raise InputError(
+                f"{self.name}: does not say which cameras it was made with: give them with --rig"
+            )
+        return Sight.of(self.rig, preset(self.sensors or preset_for(self.rig))).eye
+
+
+def map_file(path: str | Path) -> Path:
+    """Return the map file of a path, which may be the folder of a run.
+
+    Raises:
+        InputError: the folder has none.
+    """
+    file = Path(path)
+    if not file.is_dir():
+        return file
+    if not (file / FILE).exists():
+        raise InputError(f"{file}: has no {FILE}: give a map file")
+    return file / FILE
+
+
+def map_settings(config: "Config") -> dict[str, Any]:
+    """Return what a map file should say about how it was made."""
+    return {"sensors": config.tracking.sensors}
+
+
+def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
+    """Yield in what the cameras that are looked through differ, in words.
+
+    Args:
+        there: the rig of a map.
+        here: the rig of a recording.
+        sensors: stereo, rgbd or mono.
+    """
+    theirs, ours = _used(there, sensors), _used(here, sensors)
+    if len(theirs) != len(ours):
+        yield f"{len(theirs)} cameras there, {len(ours)} here"
+    for a, b in zip(theirs, ours):
+        for name, x, y in _numbers(a, b, sensors):
+            same = np.shape(x) == np.shape(y) and (
+                x == y if isinstance(x, str) else np.allclose(x, y, rtol=1e-6, atol=1e-9)
+            )
+            if not same:
+                yield f"camera {b.name}: {name} is {_text(x)} there, {_text(y)} here"
+
+
+def _used(rig: Rig, sensors: str) -> tuple[CameraMount, ...]:
+    """Return the cameras that are looked through."""
+    if sensors == "rgbd" and rig.depth is not None:
+        return (rig.camera(rig.depth.camera),)
+    return rig.cameras[: 2 if sensors == "stereo" else 1]
+
+
+def _numbers(a: CameraMount, b: CameraMount, sensors: str) -> Iterator[tuple[str, Any, Any]]:
+    """Yield what has to be the same of two cameras: a name and both values."""
+    yield "the model", a.camera.model, b.camera.model
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion"):
+        yield name, getattr(a.camera, name), getattr(b.camera, name)
+    if sensors != "mono":  # a single camera is the body, wherever it is mounted
+        yield "T_body_camera", a.T_body_camera.matrix, b.T_body_camera.matrix
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str | int):
+        return str(value)
+    return str(np.array(value).round(6).tolist()) if np.ndim(value) else f"{value:.9g}"
