@@ -1,6 +1,7 @@
 """A synthetic run: a noisy path around a room, its estimates, and a procedural picture."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,8 @@ from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.estimate import Estimate, Status, Tracks
-from odomap.views.record import Report, Sample
+from odomap.views.covisibility import MapView
+from odomap.views.record import Growth, Report, Sample
 
 START_NS = 1_403_636_579_763_555_584
 PERIOD_NS = 50_000_000
@@ -90,6 +92,27 @@ def estimates(n: int, lost: range = range(0)) -> list[Estimate]:
     return out
 
 
+def map_view(landmarks: np.ndarray, every: int = 5) -> MapView:
+    """Keyframes along the path, of which those near each other share much."""
+    trajectory, _ = paths(160)
+    keyframes = trajectory.positions[::every]
+    i, j = np.triu_indices(len(keyframes), 1)
+    apart = np.linalg.norm(keyframes[i] - keyframes[j], axis=1)
+    shared = np.round(260 * np.exp(-apart)).astype(np.int64)
+    order = np.argsort(shared, kind="stable")
+    kept = order[shared[order] >= 15]
+    pairs = np.stack([i, j], axis=1)[kept]
+    return MapView(keyframes, landmarks[::10], pairs, shared[kept], len(kept))
+
+
+def growth(n: int) -> Growth:
+    """Half of a loop makes a map, the other half finds it."""
+    k = np.arange(n)
+    keyframes = np.minimum(1 + k // 7, n // 14) - (k % 50 > 40)
+    memory = 300.0 + 40.0 * np.minimum(k[::10] / n, 0.5)
+    return Growth(keyframes, 140 * keyframes, k[::10], memory)
+
+
 def make_report(n: int = 160, lost: range = range(0), **changes: object) -> Report:
     trajectory, truth = paths(n)
     every = estimates(n, lost)
@@ -140,4 +163,8 @@ def report_of() -> Callable[..., Report]:
 
 @pytest.fixture(scope="session")
 def report() -> Report:
-    return make_report(lost=range(61, 70))
+    """A run that tells of its map as well."""
+    run = make_report(lost=range(61, 70))
+    assert run.points is not None
+    counts = {"landmarks_created": 15321, "keyframes_culled": 9}
+    return replace(run, map=map_view(run.points), growth=growth(160), mapping=counts)

@@ -25,8 +25,8 @@ from odomap.views.plots import (
 )
 from odomap.views.record import Report
 from odomap.views.scene import gaps_as_nan, scene, thin, unit_of
-from odomap.views.style import PALETTE
-from odomap.views.timelines import stage_times
+from odomap.views.style import PALETTE, STAGES
+from odomap.views.timelines import stage_colours, stage_times
 
 Make = Callable[..., Report]
 
@@ -286,3 +286,25 @@ def test_gaps_break_lines() -> None:
 
 def test_units_of_axes() -> None:
     assert [unit_of(v)[1] for v in (12.0, 0.3, 0.004)] == ["m", "cm", "mm"]
+
+
+def test_stages_of_the_most_frames_come_first_and_keep_their_colours(report: Report) -> None:
+    first = replace(report.estimates[0], timing={"keyframe": 9.0})
+    rest = [replace(e, timing={"track": 3.0, "map": 1.0}) for e in report.estimates[1:]]
+    stages = stage_times([first, *rest])
+    assert list(stages) == ["track", "map", "keyframe"]
+    assert list(stage_colours(stages).values()) == list(STAGES[:3])
+    many = {f"stage {k}": np.full(3, float(k)) for k in range(12)}
+    colours = stage_colours(many)
+    assert [colours[f"stage {k}"] for k in range(6, 12)] == list(STAGES[:6])
+    assert {colours[f"stage {k}"] for k in range(6)} == {STAGES[6]}
+
+
+def test_a_long_legend_stays_inside_the_figure(report: Report) -> None:
+    timing = {f"a rather long stage {k}": 1.0 for k in range(12)}
+    figure = timing_figure([replace(e, timing=timing) for e in report.estimates])
+    figure.canvas.draw()
+    ax = figure.axes[0]
+    box = ax.get_legend().get_window_extent()
+    assert box.y1 <= figure.bbox.y1
+    assert box.x0 >= figure.bbox.x0

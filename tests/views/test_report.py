@@ -75,7 +75,7 @@ def floats(packed: object) -> np.ndarray:
 def test_all_sections_are_there_and_linked(page: str) -> None:
     reader = read(page)
     names = [a["id"] for tag, a in reader.tags if tag == "section"]
-    assert names == ["path", "error", "features", "timing", "frames", "problems", "run"]
+    assert names == ["path", "map", "error", "features", "timing", "frames", "problems", "run"]
     links = [a["href"] for tag, a in reader.tags if tag == "a"]
     assert links == [f"#{name}" for name in names]
     ids = [a["id"] for _, a in reader.tags if "id" in a]
@@ -120,7 +120,7 @@ def test_pictures_decode_and_have_words(page: str, report: Report) -> None:
         assert opened.size == (752, 480)
         assert "inliers of 280 tracks" in str(attributes["alt"])
     drawings = [a for tag, a in read(page).tags if tag == "svg"]
-    assert len(drawings) == 4
+    assert len(drawings) == 6
     assert all(a["role"] == "img" and a["aria-label"] for a in drawings)
 
 
@@ -294,3 +294,17 @@ def test_matplotlib_is_loaded_late_and_pyplot_never() -> None:
         "import odomap.views.plots; assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_figures_of_a_stage_are_those_of_its_frames(report_of: Make) -> None:
+    run = report_of(20, samples=())
+    timing = [{"track": 2.0} | ({"map": 8.0} if k == 4 else {}) for k in range(20)]
+    estimates = [replace(e, timing=ms) for e, ms in zip(run.estimates, timing)]
+    shown = render_report(replace(run, estimates=estimates))
+    rows = re.findall(r"<tr><td><i class=.swatch.[^>]*></i>(.*?)</tr>", shown)
+    cells = [re.sub(r"<[^>]+>", " ", row).split() for row in rows]
+    assert cells == [
+        ["track", "20", "2.00", "2.00", "2.00", "83", "%"],
+        ["map", "1", "8.00", "8.00", "8.00", "17", "%"],
+        ["all", "stages", "20", "2.00", "2.40", "10.0", "100", "%"],
+    ]

@@ -43,9 +43,11 @@ def growth_figure(estimates: Sequence[Estimate], growth: Growth) -> Figure | Non
         return None
     figure = new_figure(9.6, 2.5)
     axes = figure.subplots(1, len(panels), squeeze=False, gridspec_kw={"wspace": 0.2})[0]
+    end = max(float(seconds(estimates)[-1]), 1e-3)
     for ax, panel in zip(axes, panels):
         dress(ax, panel.title, "time [s]")
         _draw(ax, panel)
+        ax.set_xlim(-0.01 * end, 1.01 * end)
     return figure
 
 
@@ -53,8 +55,10 @@ def _panels(estimates: Sequence[Estimate], growth: Growth) -> list[_Panel]:
     t = seconds(estimates)
     panels = []
     if len(t) and len(growth.keyframes) == len(t):
-        made = np.cumsum([e.is_keyframe for e in estimates]).astype(np.float64)
-        panels.append(_Panel("Keyframes", t, growth.keyframes.astype(np.float64), made))
+        made = growth.before(estimates) + np.cumsum([e.is_keyframe for e in estimates])
+        panels.append(
+            _Panel("Keyframes", t, growth.keyframes.astype(np.float64), made.astype(np.float64))
+        )
         panels.append(_Panel("Landmarks", t, growth.landmarks.astype(np.float64)))
     inside = growth.memory_frames < len(t)
     if inside.any() and (growth.memory_mb[inside] > 0).all():
@@ -76,4 +80,3 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         top = max(top, float(panel.made.max()))
         legend(ax)
     ax.set_ylim(0.0, max(1.12 * top, 1.0))
-    ax.margins(x=0.01)

@@ -1,11 +1,14 @@
 """The part of a report that shows the map: from above, how it grew, and what mapping did to it."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from odomap.views.covisibility import MapView
 from odomap.views.page import table, text
-from odomap.views.record import Report
+from odomap.views.record import Growth, Report
 from odomap.views.scene import AXES, scene
+
+if TYPE_CHECKING:
+    from odomap.views.covisibility import MapView
 
 __all__ = ["map_section"]
 
@@ -22,17 +25,19 @@ def _plan(report: Report) -> str:
     from odomap.views.plan import plan_axes, plan_figure
     from odomap.views.style import figure_svg
 
+    axes = plan_axes(place)
+    least = AXES[next(k for k in range(3) if k not in axes)]
+    where = "the side" if place.up_axis in axes else "above"
     against = " and the truth" if place.truth is not None else ""
     svg = figure_svg(
         plan_figure(place, view, report.unit),
-        f"Landmarks, keyframes, the path{against}, from above",
+        f"Landmarks, keyframes, the path{against}, from {where}",
     )
-    least = next(k for k in range(3) if k not in plan_axes(place))
-    caption = f"Seen along {AXES[least]}, the axis along which the path extends least."
-    return f"<figure>{svg}<figcaption>{text(f'{caption} {_joined(view)}')}</figcaption></figure>"
+    caption = f"Seen along {least}, the axis along which the path extends least. {_joined(view)}"
+    return f"<figure>{svg}<figcaption>{text(caption)}</figcaption></figure>"
 
 
-def _joined(view: MapView) -> str:
+def _joined(view: "MapView") -> str:
     """Say what the lines between keyframes are."""
     if not view.num_pairs:
         return f"No two keyframes share {view.least} landmarks."
@@ -58,16 +63,22 @@ def _growth(report: Report) -> str:
         return ""
     is_counted = len(growth.keyframes) > 0
     what = "Keyframes, landmarks and memory" if is_counted else "Memory"
-    words = []
-    if is_counted:
-        made = sum(e.is_keyframe for e in report.estimates)
-        left = int(growth.keyframes[-1])
-        words.append(f"{made:,} keyframes were made, {left:,} are in the map after the last frame.")
-        words.append("Where the lines are flat, the camera found what it knew.")
     svg = figure_svg(figure, f"{what} over time")
+    words = _grown(report, growth) if is_counted else ""
+    caption = f"<figcaption>{text(words)}</figcaption>" if words else ""
+    title = "How it grew" if is_counted else "Memory"
+    return f"<h3>{title}</h3>\n<figure>{svg}{caption}</figure>"
+
+
+def _grown(report: Report, growth: Growth) -> str:
+    """Say what became of the keyframes that were made."""
+    there = growth.before(report.estimates)
+    before = f"in the map before, {there:,}; " if there else ""
+    made = sum(e.is_keyframe for e in report.estimates)
+    left = int(growth.keyframes[-1])
     return (
-        f"<h3>{'How it grew' if is_counted else 'Memory'}</h3>\n<figure>{svg}"
-        f"<figcaption>{text(' '.join(words))}</figcaption></figure>"
+        f"Keyframes: {before}made, {made:,}; in the map after the last frame, {left:,}. "
+        "Where the lines are flat, the camera found what it knew."
     )
 
 

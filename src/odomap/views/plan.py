@@ -1,9 +1,9 @@
-"""The map seen from above: landmarks, keyframes and what joins them, the path and the truth.
+"""The plan of a map: landmarks, keyframes and what joins them, the path and the truth.
 
-A plan shows the two axes along which the path extends most, so it is seen along the third. The
-picture reaches as far as nearly all landmarks do, but not to the few badly triangulated ones that
-would press the rest into a dot. Thousands of dots and lines are one drawing element each kind,
-which keeps a page small.
+A plan shows the two axes along which the path extends most, so it is seen along the third: from
+above as a rule, from the side where the camera rather climbed. The picture reaches as far as nearly
+all landmarks do, but not to the few badly triangulated ones that would press the rest into a dot.
+Thousands of dots and lines are one drawing element each kind, which keeps a page small.
 """
 
 from typing import Any
@@ -28,10 +28,10 @@ PATH_POINTS = 900
 REACH = 10.0
 """Landmarks farther from the path's middle than this many of its radii are out of the picture."""
 
-USUAL = 1.5
+USUAL = 3.0
 """Percent of the landmarks at either end of an axis that the picture need not reach."""
 
-ALPHAS = (0.12, 0.22, 0.36, 0.55)
+ALPHAS = (0.16, 0.28, 0.42, 0.6)
 """How strongly a pair of keyframes is joined: each step is twice as many landmarks shared."""
 
 
@@ -47,7 +47,7 @@ def plan_axes(place: Scene) -> tuple[int, int]:
 
 
 def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
-    """Draw a map from above.
+    """Draw a map, seen along the axis along which the path extends least.
 
     Args:
         place: the path, and its truth.
@@ -57,7 +57,8 @@ def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
     figure = new_figure(9.6, 5.6)
     axes = plan_axes(place)
     names = [f"{AXES[k]} [{unit}]" for k in axes]
-    ax = dress(figure.subplots(), "The map from above", *names)
+    title = "From the side" if place.up_axis in axes else "From above"
+    ax = dress(figure.subplots(), title, *names)
     keyframes = _moved(place, view.keyframes)[:, axes]
     landmarks = _moved(place, view.landmarks)
     landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
@@ -66,7 +67,7 @@ def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
     _joins(ax, keyframes, view)
     _lines(ax, place, axes)
     shown = keyframes[thin(len(keyframes), KEYFRAMES)]
-    _dots(ax, shown, 3.6, color=PALETTE["keyframe"], zorder=5)
+    _dots(ax, shown, 3.2, color=PALETTE["keyframe"], zorder=5)
     for index, marker, label in ((0, "o", "start"), (-1, "s", "end")):
         at = place.positions[index, list(axes)]
         style = {"ms": 6, "mfc": "none", "mec": PALETTE["ink"], "ls": "", "zorder": 6}

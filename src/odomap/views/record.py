@@ -67,6 +67,10 @@ class Growth:
     memory_frames: NDArray[np.int64]
     memory_mb: NDArray[np.float64]
 
+    def before(self, estimates: Sequence[Estimate]) -> int:
+        """Return how many keyframes the map had before the first frame, as one loaded has."""
+        return int(self.keyframes[0]) - bool(estimates[0].is_keyframe)
+
 
 def environment() -> dict[str, str]:
     """Describe what a run ran on: versions of what decides its numbers, system, cores."""
