@@ -106,8 +106,7 @@ class Column(Generic[S]):
         if fresh <= 0:
             return
         if self._heir is None and 4 * rows > 3 * len(self.values):
-            longer = (max(2 * len(self.values), 2 * rows, 64), *self.values.shape[1:])
-            self._heir = Copy(np.zeros(longer, self.values.dtype))
+            self._heir = self._follower(max(2 * len(self.values), 2 * rows, 64))
         if self._heir is not None:
             is_full = rows > len(self.values)
             pace = self._rows if is_full else PACE * fresh + LEAST
@@ -116,12 +115,12 @@ class Column(Generic[S]):
                 self.values, self._heir = grown(self._heir.array, rows), None
         for copy in self._copies:
             copy.array = grown(copy.array, rows)
+        self[self._rows : rows] = 0
         self._rows = rows
 
     def begin_copy(self) -> Copy[S]:
         """Return a copy without rows, which from now on gets what is written."""
-        # twice the rows, so that it hardly ever has to grow; what is not touched takes no memory
-        copy = Copy(np.zeros((2 * self._rows + LEAST, *self.values.shape[1:]), self.values.dtype))
+        copy = self._follower(2 * self._rows + LEAST)  # so that it hardly ever has to grow
         self._copies = (*self._copies, copy)
         return copy
 
@@ -147,6 +146,10 @@ class Column(Generic[S]):
         """Return a column of a copy's rows, which stays as it is now."""
         self._copies = tuple(other for other in self._copies if other is not copy)
         return Column(copy.array[: self._rows])
+
+    def _follower(self, rows: int) -> Copy[S]:
+        """Return a copy without rows; memory that is never touched is never given out."""
+        return Copy(np.empty((rows, *self.values.shape[1:]), self.values.dtype))
 
     @property
     def _row_bytes(self) -> int:

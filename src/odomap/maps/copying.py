@@ -27,9 +27,9 @@ class Copying:
 
     @property
     def is_nearly_done(self) -> bool:
-        """Whether what is left may be copied in one step."""
+        """Whether what is left may be copied in the last step, which has other work as well."""
         left = sum(column.left(copy) for column, copy in self._jobs)
-        return left <= STEP
+        return left <= STEP // 4
 
     def step(self) -> None:
         """Copy some more."""

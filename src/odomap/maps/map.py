@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
-from odomap.maps.columns import distinct, distinct_in_order, members, positions
+from odomap.maps.columns import distinct, distinct_in_order, members
 from odomap.maps.copying import Copying
+from odomap.maps.cutting import Cut, snapshot_from
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import act, act_inverse
 from odomap.maps.surroundings import Surroundings
@@ -34,6 +35,9 @@ __all__ = ["Map"]
 
 PAUSE_S = 5e-5
 """Seconds for which the lock is left to others between two steps of a copy."""
+
+LARGE = 50_000
+"""Observations in a snapshot above which the map is copied first, in steps."""
 
 
 class Map(Surroundings):
@@ -121,28 +125,38 @@ class Map(Surroundings):
 
         Each leaves a stub below its parent; its landmarks are stored relative to the oldest
         keyframe that still sees them, or else to the parent; its observations go. Those culled
-        already are passed over.
+        already are passed over. Several are culled one by one, with the lock free between.
 
         Args:
             keyframe_ids: (n,) keyframes; one at least must remain in the map.
         """
         with self.lock:
-            ids = [k for k in self._ids(keyframe_ids).tolist() if self._known(k) in self._keyframes]
-            if ids and len(set(ids)) == len(self._keyframes):
+            ids = distinct_in_order(self._all_known(keyframe_ids))
+            if len(ids) and np.isin(self._tree.alive(), ids).all():
                 raise ValueError("culling would leave no keyframe in the map")
-            for k in dict.fromkeys(ids):
-                self._drop_observations_of(np.array([k]))
-                slots = self._landmarks.anchored(np.array([k]))
-                placement = self._tree.placements(self.states, np.array([k]))
-                points = act(placement, self._landmarks.p_anchor[slots])
-                holder = self._tree.cull(self.states, k)
-                heirs = self._observations.first_keyframe(slots)
-                heirs[heirs < 0] = holder
-                p_anchor = act_inverse(self.states.placements(heirs), points)
-                self._landmarks.reanchor(slots, heirs, p_anchor)
-                del self._keyframes[k]
-                self._newest = holder if self._newest == k else self._newest
-            self.version += 1
+        for n, k in enumerate(ids.tolist()):
+            if n:
+                time.sleep(PAUSE_S)
+            with self.lock:
+                if k in self._keyframes:
+                    self._cull(k)
+
+    def _cull(self, k: int) -> None:
+        if len(self._keyframes) == 1:
+            raise ValueError("culling would leave no keyframe in the map")
+        keyframe = np.array([k])
+        self._drop_observations_of(keyframe)
+        slots = self._landmarks.anchored(keyframe)
+        placement = self._tree.placements(self.states, keyframe)
+        points = act(placement, self._landmarks.p_anchor[slots])
+        holder = self._tree.cull(self.states, k)
+        heirs = self._observations.first_keyframe(slots)
+        heirs[heirs < 0] = holder
+        p_anchor = act_inverse(self.states.placements(heirs), points)
+        self._landmarks.reanchor(slots, heirs, p_anchor)
+        del self._keyframes[k]
+        self._newest = holder if self._newest == k else self._newest
+        self.version += 1
 
     def retire_keyframes(self, keyframe_ids: ArrayLike) -> None:
         """Forget what keyframes saw, and keep where they are: for odometry, which never returns.
@@ -176,39 +190,50 @@ class Map(Surroundings):
             The keyframes in the order given, fixed ones last, with the landmarks that a free one
             sees and all their observations in these keyframes.
         """
-        free, held = self._ids(keyframe_ids), distinct_in_order(self._ids(fixed_ids))
+        held = distinct_in_order(self._ids(fixed_ids))
+        free = self._ids(keyframe_ids)
         free = distinct_in_order(free[~np.isin(free, held)])
         with self.lock:
-            ids = self._all_known(np.concatenate([free, held]))
-            ids = ids[self._tree.status[ids] == ALIVE]
-            if not len(ids):
-                raise ValueError("a snapshot needs a keyframe that is in the map")
-            is_fixed = np.isin(ids, held)
-            indptr, rows = self._observations.of_keyframes(ids if landmarks else ids[:0])
-            _, slots, keypoints = self._observations.read(rows)
-            position = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-            seen = members(slots[~is_fixed[position]])
-            Ts, scales = self.states.placements(ids)
-            landmark_ids = self._landmarks.ids[seen]
-            points = self._points(seen)
-            keyframes = tuple(self._keyframes[k] for k in ids.tolist())
-            version, epoch = self.version, self.epoch
-        index = positions(slots, seen)
-        used = index >= 0
-        return Snapshot(
-            keyframes=keyframes,
-            keyframe_ids=ids,
-            is_fixed=is_fixed,
-            Ts_world_body=Ts,
-            scales=scales,
-            landmark_ids=landmark_ids,
-            points_world=points,
-            obs_keyframe=position[used],
-            obs_landmark=index[used],
-            obs_keypoint=keypoints[used],
-            anchor_id=int(ids[is_fixed][0]) if is_fixed.any() else int(ids[0]),
-            version=version,
-            epoch=epoch,
+            cut = self._cut(free, held, landmarks, LARGE)
+        if cut is None:
+            cut = self._twin()._cut(free, held, landmarks)
+        assert cut is not None
+        return snapshot_from(cut)
+
+    def _cut(
+        self,
+        free: NDArray[np.int64],
+        held: NDArray[np.int64],
+        landmarks: bool,
+        most: float = np.inf,
+    ) -> Cut | None:
+        """Copy the rows of a part, or return None where it has more observations than allowed."""
+        ids = self._all_known(np.concatenate([free, held]))
+        is_alive = self._tree.status[ids] == ALIVE
+        ids, num_free = ids[is_alive], int(is_alive[: len(free)].sum())
+        if not len(ids):
+            raise ValueError("a snapshot needs a keyframe that is in the map")
+        seeing = ids if landmarks else ids[:0]
+        if self._observations.count_of(seeing).sum() > most:
+            return None
+        indptr, rows = self._observations.of_keyframes(seeing)
+        _, obs_slot, obs_keypoint = self._observations.read(rows)
+        slots = members(obs_slot[: indptr[min(num_free, len(seeing))]])
+        anchors = self._landmarks.anchor.take(slots).astype(np.int64)
+        return Cut(
+            keyframes=tuple(self._keyframes[k] for k in ids.tolist()),
+            ids=ids,
+            num_free=num_free,
+            placements=self.states.placements(ids),
+            slots=slots,
+            landmark_ids=self._landmarks.ids[slots],
+            anchors=self.states.placements(anchors),
+            p_anchor=self._landmarks.p_anchor.take(slots),
+            indptr=indptr,
+            obs_slot=obs_slot,
+            obs_keypoint=obs_keypoint,
+            version=self.version,
+            epoch=self.epoch,
         )
 
     def apply(self, update: Update) -> None:

@@ -114,6 +114,10 @@ class Observations:
         """Return how many keyframes see each of (N,) landmark slots."""
         return self._by_landmark.counts(landmarks)
 
+    def count_of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many landmarks each of (N,) keyframes sees."""
+        return self._by_keyframe.counts(keyframes)
+
     def first_keyframe(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lowest keyframe that sees each of (N,) landmark slots, -1 where none does."""
         indptr, rows = self.of_landmarks(landmarks)

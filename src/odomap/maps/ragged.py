@@ -42,7 +42,6 @@ class Ragged:
         """Return the same lists, to be read only, made of copies of `columns`."""
         twin = Ragged()
         twin._start, twin._count, twin._values = next(copies), next(copies), next(copies)
-        twin._capacity.reserve(len(twin._start))
         return twin
 
     def counts(self, owners: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -59,9 +59,10 @@ def _followers(
     tree: Tree, moved: NDArray[np.int64], version: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the keyframes created since, and the index in `moved` of the ancestor they follow."""
-    leader = {k: n for n, k in enumerate(moved.tolist())}
+    newborn = tree.newborn(version).tolist()
+    leader = {k: n for n, k in enumerate(moved.tolist())} if newborn else {}
     followers, leaders = [], []
-    for keyframe in tree.newborn(version).tolist():  # parents come before their children
+    for keyframe in newborn:  # parents come before their children
         if keyframe in leader:
             continue
         ancestor = leader.get(int(tree.parent[keyframe]))
