@@ -208,7 +208,8 @@ def test_a_point_is_the_least_squares_one(with_depth):
     rng = np.random.default_rng(3)
     n = 40
     truth = rng.uniform([-2, -2, 4], [2, 2, 8], (n, 3))
-    R, t = np.tile(np.eye(3), (2, 1, 1)), np.array([[0.0, 0, 0], [-0.5, 0.1, 0.2]])
+    t = np.array([[0.0, 0, 0], [-0.5, 0.1, 0.2]])
+    Ts = np.concatenate([np.tile(np.eye(3), (2, 1, 1)), t[:, :, None]], axis=2)
     noise = np.array([1e-3, 2e-3, 1e-3, 9.0])
     seen = []
     for k in range(2):
@@ -229,7 +230,7 @@ def test_a_point_is_the_least_squares_one(with_depth):
         return total
 
     points, parallax, verdict = np.zeros((n, 3)), np.zeros(n), np.zeros(n, np.int64)
-    judge(seen[0], seen[1], np.ones(n, np.int64), R, t, noise, 0, points, parallax, verdict)
+    judge(seen[0], seen[1], np.ones(n, np.int64), Ts, noise, 0, points, parallax, verdict)
     good = np.isin(verdict, (0, 1 + CHECKS.index("reprojection")))
     assert good.sum() > 35
     for axis in range(3):

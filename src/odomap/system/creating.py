@@ -179,10 +179,10 @@ def _free(window: LocalWindow, k: int) -> EpipolarView:
     return EpipolarView(features.descriptors, features.bearings, features.level, usable)
 
 
-def _views(window: LocalWindow) -> tuple[Array, Array]:
-    """Return (K, 3, 3) and (K, 3): from the newest camera's axes to those of each."""
+def _views(window: LocalWindow) -> Array:
+    """Return (K, 3, 4): from the newest camera's axes to those of each."""
     Ts = se3_inverse(window.Ts_world_camera) @ window.Ts_world_camera[window.newest]
-    return np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])
+    return np.ascontiguousarray(Ts[:, :3])
 
 
 def _sightings(window: LocalWindow, keyframe: Index, keypoint: Index) -> Array:
@@ -217,7 +217,7 @@ def _judge(window: LocalWindow, pairs: _Pairs, config: CreateConfig) -> _Judged:
         _sightings(window, np.full(P, window.newest), pairs.keypoint),
         _sightings(window, pairs.neighbour, pairs.other),
         pairs.neighbour,
-        *_views(window),
+        _views(window),
         _noise(window, config),
     )
     points, parallax, verdict = np.zeros((P, 3)), np.zeros(P), np.zeros(P, np.int64)

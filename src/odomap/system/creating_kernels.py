@@ -26,37 +26,38 @@ Index = NDArray[np.int64]
 GATE, GATE_WITH_DEPTH = 5.991, 7.815
 """95 % of χ² with two and three degrees of freedom."""
 
-STEPS = 2
-"""Gauss-Newton steps of a point; the bundle adjustment takes more."""
+NEAREST = 1e-6
+"""Depth from which on a point lies ahead."""
+
+STEPS = 1
+"""Gauss-Newton steps of a point: one, as it starts within its noise."""
 
 
 @kernel
-def _add_view(
-    p: Array, R: Array, t: Array, k: int, seen: Array, i: int, noise: Array, H: Array, g: Array
-) -> float:
-    """Add JᵀJ to H (00 01 02 11 12 22) and Jᵀr to g, and return |r|² of view k, ∞ behind it.
+def _add_view(p: Array, T: Array, seen: Array, noise: Array, H: Array, g: Array) -> float:
+    """Add JᵀJ to H (00 01 02 11 12 22) and Jᵀr to g, and return |r|²; ∞ behind the view.
 
-    r = ((X/Z − x)/σ, (Y/Z − y)/σ, (1/Z − d)/σ_d), (X, Y, Z) = R_k p + t_k; no third without d.
+    r = ((X/Z − x)/σ, (Y/Z − y)/σ, (1/Z − d)/σ_d), (X, Y, Z) = R p + t; no third without d.
     """
-    X = R[k, 0, 0] * p[0] + R[k, 0, 1] * p[1] + R[k, 0, 2] * p[2] + t[k, 0]
-    Y = R[k, 1, 0] * p[0] + R[k, 1, 1] * p[1] + R[k, 1, 2] * p[2] + t[k, 1]
-    Z = R[k, 2, 0] * p[0] + R[k, 2, 1] * p[1] + R[k, 2, 2] * p[2] + t[k, 2]
-    if not Z > 1e-6:
+    X = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    Y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    Z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    if not Z > NEAREST:
         return np.inf
     chi2, inverse = 0.0, 1.0 / Z
-    w = 1.0 / (noise[0] * seen[i, 3])
+    w = 1.0 / (noise[0] * seen[3])
     for axis in range(3):
         value = X * inverse if axis == 0 else (Y * inverse if axis == 1 else inverse)
-        if axis == 2 and not np.isfinite(seen[i, 2]):
+        if axis == 2 and not np.isfinite(seen[2]):
             break
         if axis == 2:
             w, own = 1.0 / noise[1], 0.0  # d(1/Z) = −(1/Z)² dZ
         else:
             own = 1.0
-        r = w * (value - seen[i, axis])
-        j0 = w * inverse * (own * R[k, axis, 0] - value * R[k, 2, 0])
-        j1 = w * inverse * (own * R[k, axis, 1] - value * R[k, 2, 1])
-        j2 = w * inverse * (own * R[k, axis, 2] - value * R[k, 2, 2])
+        r = w * (value - seen[axis])
+        j0 = w * inverse * (own * T[axis, 0] - value * T[2, 0])
+        j1 = w * inverse * (own * T[axis, 1] - value * T[2, 1])
+        j2 = w * inverse * (own * T[axis, 2] - value * T[2, 2])
         H[0] += j0 * j0
         H[1] += j0 * j1
         H[2] += j0 * j2
@@ -89,39 +90,37 @@ def _step(H: Array, g: Array, p: Array) -> bool:
 
 
 @kernel
-def _start(
-    first: Array, second: Array, i: int, R: Array, t: Array, k: int, noise: Array, p: Array
-) -> float:
+def _start(first: Array, second: Array, T: Array, noise: Array, p: Array) -> float:
     """Write a first guess of the point into p, and return what tells its depth, rad.
 
     p is nearest to both rays, λa and c + μb, or, where a depth measured in one of the views is
     worth a wider angle, w = σ d/σ_d, than α between the rays, at that depth. Returns
     √(α² + Σ w²). Where the rays meet behind a camera p is put behind the first one.
     """
-    ax, ay = first[i, 0], first[i, 1]
-    x, y = second[i, 0], second[i, 1]
-    bx = R[k, 0, 0] * x + R[k, 1, 0] * y + R[k, 2, 0]
-    by = R[k, 0, 1] * x + R[k, 1, 1] * y + R[k, 2, 1]
-    bz = R[k, 0, 2] * x + R[k, 1, 2] * y + R[k, 2, 2]
-    cx = -(R[k, 0, 0] * t[k, 0] + R[k, 1, 0] * t[k, 1] + R[k, 2, 0] * t[k, 2])
-    cy = -(R[k, 0, 1] * t[k, 0] + R[k, 1, 1] * t[k, 1] + R[k, 2, 1] * t[k, 2])
-    cz = -(R[k, 0, 2] * t[k, 0] + R[k, 1, 2] * t[k, 1] + R[k, 2, 2] * t[k, 2])
+    ax, ay = first[0], first[1]
+    x, y = second[0], second[1]
+    bx = T[0, 0] * x + T[1, 0] * y + T[2, 0]
+    by = T[0, 1] * x + T[1, 1] * y + T[2, 1]
+    bz = T[0, 2] * x + T[1, 2] * y + T[2, 2]
+    cx = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
+    cy = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
+    cz = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
     ab = ax * bx + ay * by + bz
     ac = ax * cx + ay * cy + cz
     bc = bx * cx + by * cy + bz * cz
     aa, bb = ax * ax + ay * ay + 1.0, bx * bx + by * by + bz * bz
     square = (ay * bz - by) ** 2 + (bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
     angle = np.arctan2(np.sqrt(square), ab)
-    worth = noise[0] * first[i, 3] * first[i, 2] / noise[1]
+    worth = noise[0] * first[3] * first[2] / noise[1]
     worth = worth if worth > 0.0 else 0.0
-    other = noise[0] * second[i, 3] * second[i, 2] / noise[1]
+    other = noise[0] * second[3] * second[2] / noise[1]
     other = other if other > 0.0 else 0.0
     p[0], p[1], p[2] = 0.0, 0.0, -1.0
     if worth > angle and worth >= other:
-        z = 1.0 / first[i, 2]
+        z = 1.0 / first[2]
         p[0], p[1], p[2] = z * ax, z * ay, z
     elif other > angle:
-        z = 1.0 / second[i, 2]
+        z = 1.0 / second[2]
         p[0], p[1], p[2] = cx + z * bx, cy + z * by, cz + z * bz
     elif square > 0.0:
         along, beyond = (bb * ac - ab * bc) / square, (ab * ac - aa * bc) / square
@@ -133,23 +132,55 @@ def _start(
 
 
 @kernel
-def _is_noise(chi2: float, seen: Array, i: int) -> bool:
+def _is_noise(chi2: float, seen: Array) -> bool:
     """|r|² within what 95 of 100 true sightings have."""
-    return chi2 <= (GATE_WITH_DEPTH if np.isfinite(seen[i, 2]) else GATE)
+    return chi2 <= (GATE_WITH_DEPTH if np.isfinite(seen[2]) else GATE)
 
 
 @kernel
-def _sizes_agree(
-    p: Array, R: Array, t: Array, k: int, first: Array, second: Array, i: int, noise: Array
-) -> bool:
+def _chi2(p: Array, T: Array, seen: Array, noise: Array) -> float:
+    """|r|² of a sighting, ∞ behind the view: what `_add_view` returns, without derivatives."""
+    Z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    if not Z > NEAREST:
+        return np.inf
+    X = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    Y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    inverse, w = 1.0 / Z, 1.0 / (noise[0] * seen[3])
+    u, v = w * (X * inverse - seen[0]), w * (Y * inverse - seen[1])
+    d = (inverse - seen[2]) / noise[1]
+    return float(u * u + v * v + (d * d if np.isfinite(d) else 0.0))
+
+
+@kernel
+def _sizes_agree(p: Array, T: Array, first: Array, second: Array, noise: Array) -> bool:
     """Whether |p| / |R p + t| is the levels' s₂ / s₁, within the tolerance: far is small."""
     near, far = 0.0, 0.0
     for m in range(3):
-        q = R[k, m, 0] * p[0] + R[k, m, 1] * p[1] + R[k, m, 2] * p[2] + t[k, m]
+        q = T[m, 0] * p[0] + T[m, 1] * p[1] + T[m, 2] * p[2] + T[m, 3]
         near += p[m] * p[m]
         far += q * q
-    factor = np.sqrt(near / far) * first[i, 3] / second[i, 3]
+    factor = np.sqrt(near / far) * first[3] / second[3]
     return bool(factor <= noise[3] and factor * noise[3] >= 1.0)
+
+
+@kernel
+def _sees(p: Array, T: Array, first: Array, second: Array, noise: Array) -> bool:
+    """Whether the second sighting is one of p."""
+    chi2 = _chi2(p, T, second, noise)
+    return _is_noise(chi2, second) and _sizes_agree(p, T, first, second, noise)
+
+
+@kernel
+def _next_widest(parallax: Array, verdict: Index, begin: int, end: int, last: int) -> int:
+    """The sound pair of the widest angle after the last one, −1 for none; lower rows first."""
+    chosen = -1
+    for i in range(begin, end):
+        if verdict[i] != 0 or (chosen >= 0 and not parallax[i] > parallax[chosen]):
+            continue
+        angle = parallax[last] if last >= 0 else np.inf
+        if parallax[i] < angle or (parallax[i] == angle and i > last):
+            chosen = i
+    return chosen
 
 
 @kernel
@@ -157,8 +188,7 @@ def judge(
     first: Array,
     second: Array,
     view: Index,
-    R: Array,
-    t: Array,
+    Ts: Array,
     noise: Array,
     newest: int,
     points: Array,
@@ -168,24 +198,25 @@ def judge(
     """For each pair p = argmin Σ |r|² by Gauss-Newton, and the first check it fails (or 0)."""
     H, g = np.empty(6), np.empty(3)
     for i in range(len(first)):
-        p, k = points[i], view[i]
-        parallax[i] = _start(first, second, i, R, t, k, noise, p)
+        p, a, b, T = points[i], first[i], second[i], Ts[view[i]]
+        parallax[i] = _start(a, b, T, noise, p)
         if not parallax[i] >= noise[2]:
             verdict[i] = 1
             continue
-        a, b = np.inf, np.inf
-        for iteration in range(STEPS + 1):
-            H[:] = 0.0
-            g[:] = 0.0
-            a = _add_view(p, R, t, newest, first, i, noise, H, g)
-            b = _add_view(p, R, t, k, second, i, noise, H, g)
-            if not np.isfinite(a + b) or iteration == STEPS or not _step(H, g, p):
+        for _ in range(STEPS):
+            for m in range(6):
+                H[m], g[m // 2] = 0.0, 0.0
+            chi2 = _add_view(p, Ts[newest], a, noise, H, g)
+            chi2 += _add_view(p, T, b, noise, H, g)
+            if not (np.isfinite(chi2) and _step(H, g, p)):
                 break
-        if not np.isfinite(a + b):
+        here = _chi2(p, Ts[newest], a, noise)
+        there = _chi2(p, T, b, noise)
+        if not np.isfinite(here + there):
             verdict[i] = 2
-        elif not (_is_noise(a, first, i) and _is_noise(b, second, i)):
+        elif not (_is_noise(here, a) and _is_noise(there, b)):
             verdict[i] = 3
-        elif not _sizes_agree(p, R, t, k, first, second, i, noise):
+        elif not _sizes_agree(p, T, a, b, noise):
             verdict[i] = 4
 
 
@@ -194,8 +225,7 @@ def agree(
     first: Array,
     second: Array,
     view: Index,
-    R: Array,
-    t: Array,
+    Ts: Array,
     noise: Array,
     keypoint: Index,
     points: Array,
@@ -207,42 +237,34 @@ def agree(
 
     Pairs come sorted by keypoint; winner[j] is written for those that see the point, j included.
     """
-    H, g = np.empty(6), np.empty(3)
     begin = 0
     while begin < len(keypoint):
         end = begin + 1
         while end < len(keypoint) and keypoint[end] == keypoint[begin]:
             end += 1
-        best, most = -1, 0
-        # The last round, i = end, marks those that see the best one.
-        for i in range(begin, end + 1):
-            chosen = best if i == end else i
-            if chosen < 0 or verdict[chosen] != 0:
-                continue
-            p, votes = points[chosen], 0
+        best, most, last = -1, 0, -1
+        # From the widest angle down: one that all see cannot be beaten.
+        while most < end - begin:
+            i = _next_widest(parallax, verdict, begin, end, last)
+            if i < 0:
+                break
+            votes, last = 0, i
             for j in range(begin, end):
-                chi2 = _add_view(p, R, t, view[j], second, j, noise, H, g)
-                if _is_noise(chi2, second, j) and _sizes_agree(
-                    p, R, t, view[j], first, second, j, noise
-                ):
-                    votes += 1
-                    if i == end:
-                        winner[j] = chosen
-            if votes > most or (votes == most and parallax[chosen] > parallax[best]):
+                votes += _sees(points[i], Ts[view[j]], first[j], second[j], noise)
+                if votes + end - 1 - j <= most:
+                    break
+            if votes > most:
                 best, most = i, votes
+        for j in range(begin, end):
+            if best >= 0 and _sees(points[best], Ts[view[j]], first[j], second[j], noise):
+                winner[j] = best
         begin = end
 
 
 def warm_up() -> None:
     """Compile the kernels of this module."""
-    seen, T = np.ones((2, 4)), np.tile(np.eye(4), (2, 1, 1))
-    R, t = np.ascontiguousarray(T[:, :3, :3]), np.zeros((2, 3))
-    view, verdict, points, noise = (
-        np.ones(2, np.int64),
-        np.zeros(2, np.int64),
-        np.zeros((2, 3)),
-        np.ones(4),
-    )
-    measured = (seen, seen.copy(), view, R, t, noise)
+    seen, Ts, noise = np.ones((2, 4)), np.tile(np.eye(4)[:3], (2, 1, 1)), np.ones(4)
+    view, verdict, points = np.ones(2, np.int64), np.zeros(2, np.int64), np.zeros((2, 3))
+    measured = (seen, seen.copy(), view, Ts, noise)
     judge(*measured, 0, points, np.zeros(2), verdict)
     agree(*measured, view, points, np.zeros(2), verdict, np.zeros(2, np.int64))

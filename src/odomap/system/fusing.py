@@ -77,7 +77,7 @@ class _Window:
     Attributes:
         keypoint_of: (K, M) where each keyframe sees each landmark, −1 where it does not.
         first: (K,) row of each keyframe's first keypoint in the following.
-        keypoints, levels: (n, 2) float32 and (n,) int64, of all keyframes.
+        keypoints, levels, depth: (n, 2) float32, (n,) int64 and (n,), of all keyframes.
         look: (M, 4) per landmark the sum of unit vectors towards its observers, and the mean log
             of the distance at which it would show on the finest level; NaN where nobody sees it.
         top: the coarsest level there is.
@@ -87,6 +87,7 @@ class _Window:
     first: Index
     keypoints: NDArray[np.float32]
     levels: Index
+    depth: Array
     look: Array
     top: int
 
@@ -109,7 +110,8 @@ class _Window:
             seen,
         )
         keypoints = np.concatenate([f.keypoints for f in features])
-        return _Window(keypoint_of, first, keypoints, levels, seen, int(levels.max(initial=0)))
+        depth, top = np.concatenate([f.depth for f in features]), int(levels.max(initial=0))
+        return _Window(keypoint_of, first, keypoints, levels, depth, seen, top)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,12 +145,10 @@ def find_fusions(window: LocalWindow, config: FuseConfig, matching: MatchConfig)
     laid = _Window.of(window)
     sees = laid.keypoint_of >= 0
     own = sees[window.newest]
-    found = [_search(window, laid, window.newest, ~own, config, matching)]
-    for k in np.flatnonzero(~window.is_fixed).tolist():
-        if k != window.newest:
-            found.append(_search(window, laid, k, own & ~sees[k], config, matching))
-    columns = (np.concatenate([getattr(f, c) for f in found]) for c in _Found.__dataclass_fields__)
-    return _resolved(window, laid, _Found(*columns))
+    hits = [_search(window, laid, window.newest, ~own, config, matching)]
+    others = [k for k in np.flatnonzero(~window.is_fixed).tolist() if k != window.newest]
+    hits += [_search(window, laid, k, own & ~sees[k], config, matching) for k in others]
+    return _resolved(window, laid, _gated(window, laid, [window.newest, *others], hits))
 
 
 def _search(
@@ -158,10 +158,10 @@ def _search(
     wanted: Mask,
     config: FuseConfig,
     matching: MatchConfig,
-) -> _Found:
-    """Look for the landmarks of a (M,) mask in keyframe k."""
+) -> tuple[Index, Index, Array]:
+    """Look for landmarks of a (M,) mask in keyframe k: landmark, keypoint, u v 1/Z expected."""
     camera, features, M = window.camera, window.features(k), len(wanted)
-    guess, inverse, level = np.empty((M, 2)), np.empty(M), np.empty(M, np.int64)
+    expected, level = np.empty((M, 3)), np.empty(M, np.int64)
     expect(
         window.points_world,
         laid.look,
@@ -171,13 +171,14 @@ def _search(
         float(np.cos(np.radians(config.max_angle_deg))),
         float(np.log(window.level_scale)),
         laid.top,
-        guess,
-        inverse,
+        expected,
         level,
     )
+    ahead = np.flatnonzero(level >= 0)
+    level, expected = level[ahead], expected[ahead]
     keypoint = match_projected(
-        window.descriptors,
-        guess,
+        window.descriptors[ahead],
+        expected[:, :2],
         config.radius_px * window.level_scale ** level.astype(np.float64),
         np.maximum(level - 1, 0),
         np.minimum(level + 1, laid.top),
@@ -187,15 +188,23 @@ def _search(
         KeypointGrid.of(features.keypoints, (camera.height, camera.width)),
         matching,
     )
-    landmark = np.flatnonzero(keypoint >= 0)
-    keypoint = keypoint[landmark]
-    sigma = window.sigma_px * window.level_scale ** features.level[keypoint].astype(np.float64)
-    off = (features.keypoints[keypoint] - guess[landmark]) / sigma[:, None]
-    deep = (1.0 / features.depth[keypoint] - inverse[landmark]) / window.inverse_depth_sigma
+    hit = np.flatnonzero(keypoint >= 0)
+    return ahead[hit], keypoint[hit], expected[hit]
+
+
+def _gated(
+    window: LocalWindow, laid: _Window, keyframes: list[int], hits: list[tuple[Index, Index, Array]]
+) -> _Found:
+    """Return what was found in keyframes near enough to where it was expected."""
+    keyframe = np.repeat(keyframes, [len(landmark) for landmark, _, _ in hits])
+    landmark, keypoint, expected = (np.concatenate(column) for column in zip(*hits, strict=True))
+    at = laid.first[keyframe] + keypoint
+    sigma = window.sigma_px * window.level_scale ** laid.levels[at].astype(np.float64)
+    off = (laid.keypoints[at] - expected[:, :2]) / sigma[:, None]
+    deep = (1.0 / laid.depth[at] - expected[:, 2]) / window.inverse_depth_sigma
     chi2 = np.sum(off * off, axis=1) + np.where(np.isfinite(deep), deep * deep, 0.0)
-    fits = chi2 <= np.where(np.isfinite(deep), GATE_WITH_DEPTH, GATE)
-    found = _Found(np.full(len(landmark), k), landmark, keypoint, chi2)
-    return found.at(np.flatnonzero(fits))
+    fits = np.flatnonzero(chi2 <= np.where(np.isfinite(deep), GATE_WITH_DEPTH, GATE))
+    return _Found(keyframe[fits], landmark[fits], keypoint[fits], chi2[fits])
 
 
 def _resolved(window: LocalWindow, laid: _Window, found: _Found) -> Fusions:
@@ -204,9 +213,11 @@ def _resolved(window: LocalWindow, laid: _Window, found: _Found) -> Fusions:
     owner[laid.first[window.obs_keyframe] + window.obs_keypoint] = window.obs_landmark
     other = owner[laid.first[found.keyframe] + found.keypoint]
     taken = np.flatnonzero(other >= 0)
+    taken = taken[np.argsort(found.chi2[taken], kind="stable")]
     pairs = np.stack([found.landmark[taken], other[taken]], axis=1)
-    pairs = pairs[np.argsort(found.chi2[taken], kind="stable")]
-    survivors, gone = join(pairs, window.num_observers, lambda a, b: _is_apart(window, laid, a, b))
+    survivors, gone = join(
+        _once(pairs), window.num_observers, lambda a, b: _is_apart(window, laid, a, b)
+    )
     heir = np.arange(len(window.points_world))
     heir[gone] = survivors
     sees = np.zeros(laid.keypoint_of.shape, np.bool_)
@@ -220,6 +231,13 @@ def _resolved(window: LocalWindow, laid: _Window, found: _Found) -> Fusions:
     kept = order[once]
     kept = np.sort(kept[~sees[free.keyframe[kept], landmark[kept]]])
     return Fusions(free.keyframe[kept], landmark[kept], free.keypoint[kept], survivors, gone)
+
+
+def _once(pairs: Index) -> Index:
+    """Return (P, 2) unordered pairs without repetition, in the order of their first occurrence."""
+    low, high = np.sort(pairs, axis=1).T
+    place = low * (int(high.max(initial=0)) + 1) + high
+    return pairs[np.sort(np.unique(place, return_index=True)[1])]
 
 
 def _is_apart(window: LocalWindow, laid: _Window, a: Index, b: Index) -> Mask:

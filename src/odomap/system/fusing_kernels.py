@@ -64,18 +64,17 @@ def expect(
     cos_angle: float,
     log_scale: float,
     top: int,
-    guess: Array,
-    inverse: Array,
+    expected: Array,
     levels: Index,
 ) -> None:
-    """Write where points show: u = f X/Z + c, 1/Z and the level; NaN where they do not.
+    """Write where points show: u = f X/Z + c, 1/Z and the level; NaN and −1 where they do not.
 
     `pinhole` is fx fy cx cy width height. A level more than one step beyond the finest or the
     coarsest is too far or too near; where there is only one, levels say nothing.
     """
     T = T_camera_world
     for m in range(len(points)):
-        guess[m, 0], guess[m, 1], inverse[m], levels[m] = np.nan, np.nan, np.nan, 0
+        expected[m, 0], expected[m, 1], expected[m, 2], levels[m] = np.nan, np.nan, np.nan, -1
         if not wanted[m] or not np.isfinite(seen[m, 3]):
             continue
         p = points[m]
@@ -100,12 +99,12 @@ def expect(
         if top > 0 and not -1.0 <= level <= top + 1.0:
             continue
         levels[m] = min(max(int(np.floor(level + 0.5)), 0), top)
-        guess[m, 0], guess[m, 1], inverse[m] = u, v, 1.0 / Z
+        expected[m, 0], expected[m, 1], expected[m, 2] = u, v, 1.0 / Z
 
 
 def warm_up() -> None:
     """Compile the kernels of this module."""
     points, seen, rows = np.ones((2, 3)), np.zeros((2, 4)), np.zeros(1, np.int64)
     look(points, np.zeros((1, 3)), rows, rows, rows, 0.2, seen)
-    shown = np.zeros((2, 2)), np.zeros(2), np.zeros(2, np.int64)
+    shown = np.zeros((2, 3)), np.zeros(2, np.int64)
     expect(points, seen, np.ones(2, np.bool_), np.eye(4), np.ones(6), 0.5, 0.2, 7, *shown)
