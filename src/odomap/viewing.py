@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from odomap.system.stages import MapState
     from odomap.system.worker import Worker
 
-__all__ = ["View", "check_view", "watching"]
+__all__ = ["View", "check_view", "serve", "tracked_camera", "watching"]
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,6 @@ PATIENCE_S = 5.0
 """How long drawing may take when it is no longer wanted."""
 ENOUGH = 20
 """Landmarks in sight that tell how far a camera sees."""
-FAREWELL = "the view stays open: {} (Ctrl-C ends it)"
 
 
 class Watched(Protocol):
@@ -103,7 +102,9 @@ class View:
             config: its configuration, which says the cameras that it tracks.
         """
         self._stop()
-        self._drawing = _Drawing(self._server, system.map, *tracked_camera(rig, config))
+        self._drawing = _Drawing(
+            self._server, system.map, *tracked_camera(rig, config.tracking.sensors)
+        )
         self._frames: tuple[Frame, ...] = ()
         worker = system.worker
         worker.on_estimate.append(self._on_estimate)
@@ -122,8 +123,8 @@ class View:
         """Keep the page open until Ctrl-C; without a terminal, return at once."""
         if not sys.stderr.isatty():
             return
-        print(f"odomap: {FAREWELL.format(self.url)}", file=sys.stderr, flush=True)
-        serve()
+        print(f"odomap: the view stays open: {self.url} (Ctrl-C ends it)", file=sys.stderr)
+        serve(lambda: None)
 
     def close(self) -> None:
         """Close the page and end its threads."""
@@ -254,9 +255,13 @@ class _Drawing:
         return Panel(estimate.status.value, estimate.reason, tuple(rows))
 
 
-def tracked_camera(rig: Rig, config: "Config") -> tuple[int, CameraMount, SE3]:
-    """Return which image of a frame is tracked, its camera, and T_body_camera of the poses."""
-    sensors = config.tracking.sensors
+def tracked_camera(rig: Rig, sensors: str) -> tuple[int, CameraMount, SE3]:
+    """Return which image of a frame is tracked, its camera, and T_body_camera of the poses.
+
+    Args:
+        rig: what there is.
+        sensors: what of it is used: stereo, rgbd or mono.
+    """
     if sensors == "stereo":
         mount = rig.stereo_pair()[0]
     elif sensors == "rgbd" and rig.depth is not None:
@@ -274,10 +279,12 @@ def distance_seen(seen: Sketch, T_body_camera: SE3) -> float | None:
     return float(np.median(np.linalg.norm(seen.points[seen.is_seen] - eye, axis=1)))
 
 
-def serve() -> None:
-    """Do nothing until Ctrl-C."""
+def serve(go_on: Callable[[], object]) -> None:
+    """Call a function, some ten times per second, until Ctrl-C."""
     try:
-        threading.Event().wait()
+        while True:
+            go_on()
+            time.sleep(DRAW_EVERY_S)
     except KeyboardInterrupt:
         return
 

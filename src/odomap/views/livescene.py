@@ -9,7 +9,6 @@ as one array.
 Nothing here reads a map or a clock; whoever calls decides how often (`odomap.viewing`).
 """
 
-import contextlib
 import html
 from dataclasses import dataclass
 from typing import Any
@@ -41,7 +40,7 @@ FRUSTUM_IMAGE_PX = 320
 WIDEST_VIEW = 1.2
 """Frusta are at most so wide at distance 1, also those of a fisheye."""
 
-KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.05, 0.0035
+KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.07, 0.005
 """Sizes as shares of the distance to what the camera sees."""
 
 
@@ -77,7 +76,6 @@ class LiveScene:
         self.reach = 1.0
         wide, high = _opening(camera)
         self._opening = wide, high
-        self._met: set[int] = set()
         server.scene.reset()
         server.gui.reset()
         self._make_panel(frames)
@@ -96,7 +94,7 @@ class LiveScene:
 
     def _make_nodes(self, wide: float, high: float) -> None:
         scene = self._server.scene
-        none = np.zeros((0, 3), np.float32)
+        self._world = scene.add_frame("/run", show_axes=False)
 
         def lines(name: str, colour: Colour, thickness: float) -> Any:
             return scene.add_line_segments(
@@ -108,18 +106,24 @@ class LiveScene:
             )
 
         self._path = {
-            lost: lines(f"/path/{name}", colour, 3.0)
+            lost: lines(f"/run/path/{name}", colour, 3.0)
             for lost, name, colour in ((False, "known", PATH), (True, "lost", LOST))
         }
-        self._tail = lines("/path/newest", PATH, 3.0)
-        self._keyframes = lines("/keyframes", KEYFRAME, 1.0)
-        self._points = scene.add_point_cloud(
-            "/landmarks", none, np.zeros((0, 3), np.uint8), precision="float32"
-        )
-        self._points.point_shape = "circle"
-        self._points.point_shading = "flat"
+        self._tail = lines("/run/path/newest", PATH, 3.0)
+        self._keyframes = lines("/run/keyframes", KEYFRAME, 1.5)
+        self._points = {
+            seen: scene.add_point_cloud(
+                f"/run/landmarks/{name}",
+                np.zeros((0, 3), np.float32),
+                colour,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            )
+            for seen, name, colour in ((False, "known", LANDMARK), (True, "in sight", SEEN))
+        }
         self._camera = scene.add_camera_frustum(
-            "/camera",
+            "/run/camera",
             fov=2 * np.arctan(high),
             aspect=wide / high,
             color=CAMERA,
@@ -142,10 +146,11 @@ class LiveScene:
         self.reach = reach
         self._server.scene.set_up_direction(-T_world_camera[:3, 1])
         start = self._server.initial_camera
-        start.position, start.look_at = _behind(T_world_camera, reach), T_world_camera[:3, 3]
+        right, down, ahead = T_world_camera[:3, :3].T
+        start.position = -reach * (0.6 * ahead + 0.35 * down - 0.15 * right)
+        start.look_at = np.zeros(3)
         start.near, start.far = 1e-3 * reach, 1e4 * reach
         self._camera.scale = CAMERA_SIZE * reach
-        self._met.clear()
 
     def show_path(self, positions: Array, is_lost: NDArray[np.bool_]) -> None:
         """Draw the path so far.
@@ -175,12 +180,10 @@ class LiveScene:
             is_seen: (M,) whether the newest keyframe sees them.
             Ts_world_camera: (K, 4, 4) of the keyframes.
         """
-        colours = np.where(is_seen[:, None], SEEN, LANDMARK).astype(np.uint8)
         keep = thin(len(Ts_world_camera), KEYFRAMES)
         with self._server.atomic():
-            self._points.points = points.astype(np.float32)
-            self._points.colors = colours
-            self._points.point_size = POINT_SIZE * self.reach * self._point_size.value
+            for wanted, node in self._points.items():
+                node.points = points[is_seen == wanted].astype(np.float32)
             self._keyframes.points = frusta(
                 Ts_world_camera[keep], self._opening, KEYFRAME_SIZE * self.reach
             )
@@ -230,28 +233,17 @@ class LiveScene:
     def obey(self) -> None:
         """Do what the controls say that needs nothing but the scene."""
         self._keyframes.visible = bool(self._shows_keyframes.value)
-        self._points.point_size = POINT_SIZE * self.reach * self._point_size.value
+        for seen, node in self._points.items():
+            size = POINT_SIZE * self.reach * float(self._point_size.value)
+            node.point_size = 1.5 * size if seen else size
 
     def follow(self, T_world_camera: Array) -> None:
-        """Keep the camera in the middle of every page; who just came is placed behind it.
+        """Keep the camera where every page looks, by moving the world under the viewers' eyes.
 
-        The eye keeps its direction and distance, which are the viewer's to choose. They are taken
-        from what the page told last: also when that is late, it is right.
+        Their eyes are their own: they turn and come closer as they like, and nothing pulls at them.
         """
-        clients = self._server.get_clients()
-        target = T_world_camera[:3, 3]
-        for key, client in clients.items():
-            eye = client.camera
-            offset = eye.position - eye.look_at
-            if key not in self._met:
-                offset = _behind(T_world_camera, self.reach) - target
-            elif not self._follow.value:
-                continue
-            # A page that is closed at this instant is told nothing, and viser warns of it.
-            with contextlib.suppress(UserWarning), client.atomic():
-                eye.position = target + offset
-                eye.look_at = target
-        self._met = set(clients)
+        if self._follow.value:
+            self._world.position = -T_world_camera[:3, 3]
 
 
 def frusta(
@@ -293,10 +285,3 @@ def _opening(camera: Camera | None) -> tuple[float, float]:
         return 0.6, 0.4
     wide = min(0.5 * camera.width / camera.fx, WIDEST_VIEW)
     return wide, wide * camera.height / camera.width
-
-
-def _behind(T_world_camera: Array, reach: float) -> Array:
-    """Return an eye behind and above a camera, a little to its right."""
-    right, down, ahead = T_world_camera[:3, :3].T
-    back = 0.6 * ahead + 0.35 * down - 0.15 * right
-    return np.asarray(T_world_camera[:3, 3] - reach * back)

@@ -62,7 +62,9 @@ def open_server(host: str = HOST, port: int = PORT, title: str = "odomap") -> tu
             host=host, port=_free_port(host, port), label=title, verbose=False
         )
     server.request_share_url = _keep_private
-    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.gui.configure_theme(
+        dark_mode=True, control_width="large", show_logo=False, show_share_button=False
+    )
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}"
 
