@@ -119,7 +119,7 @@ def test_a_plan_shows_map_path_and_truth_to_scale(report_of: Make, report: Repor
     assert max(nearest) < 1e-6
 
 
-def test_the_more_is_shared_the_darker(report: Report) -> None:
+def test_the_more_is_shared_the_stronger_the_line(report: Report) -> None:
     place = scene(report.trajectory, report.truth)
     assert place is not None
     assert report.map is not None
@@ -201,7 +201,7 @@ def test_the_section_says_what_is_seen(report: Report) -> None:
     shown = map_section(report)
     assert "Seen along z, the axis along which the path extends least." in shown
     assert report.map is not None
-    assert f"the more the darker ({report.map.num_pairs} pairs)" in shown
+    assert f"the more they share ({report.map.num_pairs} pairs)" in shown
     made, left = sum(e.is_keyframe for e in report.estimates), 11
     assert f"Keyframes: made, {made}; in the map after the last frame, {left}." in shown
     assert "<td>landmarks created</td>" in shown

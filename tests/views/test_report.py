@@ -302,6 +302,7 @@ def test_figures_of_a_stage_are_those_of_its_frames(report_of: Make) -> None:
     estimates = [replace(e, timing=ms) for e, ms in zip(run.estimates, timing)]
     shown = render_report(replace(run, estimates=estimates))
     rows = re.findall(r"<tr><td><i class=.swatch.[^>]*></i>(.*?)</tr>", shown)
+    assert "background:var(--stage1)" in shown
     cells = [re.sub(r"<[^>]+>", " ", row).split() for row in rows]
     assert cells == [
         ["track", "20", "2.00", "2.00", "2.00", "83", "%"],

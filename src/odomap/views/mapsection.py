@@ -46,8 +46,8 @@ def _joined(view: "MapView") -> str:
         "" if len(view.pairs) == view.num_pairs else f", the strongest {len(view.pairs):,} drawn"
     )
     return (
-        f"Green lines join keyframes that share {view.least} landmarks or more, the more the "
-        f"darker ({pairs}{drawn})."
+        f"Green lines join keyframes that share {view.least} landmarks or more, the stronger the "
+        f"more they share ({pairs}{drawn})."
     )
 
 

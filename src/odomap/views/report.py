@@ -188,6 +188,7 @@ def _features(report: Report) -> str:
 
 def _timing(report: Report) -> str:
     from odomap.views.plots import figure_svg, timing_figure
+    from odomap.views.style import css_colour
     from odomap.views.timelines import stage_colours, stage_times
 
     stages = stage_times(report.estimates)
@@ -196,7 +197,7 @@ def _timing(report: Report) -> str:
     svg = figure_svg(timing_figure(report.estimates), "Milliseconds of each stage, per frame")
     total = np.sum(list(stages.values()), axis=0)
     whole = max(float(total.sum()), 1e-12)
-    colours = stage_colours(stages)
+    colours = {name: css_colour(colour) for name, colour in stage_colours(stages).items()}
     rows = []
     for name, ms in [*stages.items(), ("all stages", total)]:
         ran = ms if name not in stages else ms[[name in e.timing for e in report.estimates]]

@@ -20,6 +20,7 @@ __all__ = [
     "ERROR_COLOURS",
     "PALETTE",
     "STAGES",
+    "css_colour",
     "dress",
     "figure_jpeg",
     "figure_png",
@@ -72,6 +73,11 @@ def new_figure(width: float = 9.6, height: float = 3.2, right: float = 0.12) -> 
         top=1.0 - 0.32 / height,
     )
     return figure
+
+
+def css_colour(colour: str) -> str:
+    """Return a colour of the palette as the CSS variable that follows light and dark."""
+    return next((f"var(--{name})" for name, own in PALETTE.items() if own == colour), colour)
 
 
 def plain(label: str) -> str:
