@@ -8,8 +8,8 @@ that still passes,
 
 so that one pass serves every threshold: a corner at t has s > t. Minima over the 16 arcs are built
 from minima of 2, 4 and 8 neighbours, without a branch, on bytes; the compiler works on 32 pixels at
-a time and the score of every pixel costs less than the usual early exits. Peaks of 3x3 scores stay;
-a parabola through the peak and its neighbours gives a fraction of a pixel.
+a time, and the score of every pixel costs less than the usual early exits. Peaks of 3x3 scores
+stay; a parabola through a peak and its neighbours gives a fraction of a pixel.
 
 Cost: one pass over the image, some 2 ns per pixel in all.
 
@@ -32,7 +32,7 @@ LEAST_BORDER_PX = 4
 
 def fast_corners(
     image: Image, threshold: int, border_px: int = LEAST_BORDER_PX
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.int32], Image]:
     """Find the corners of an image.
 
     Args:
@@ -41,20 +41,40 @@ def fast_corners(
         border_px: margin without corners, at least `LEAST_BORDER_PX`.
 
     Returns:
-        (N, 3) int32 pixels x, y and scores, row by row, and (N, 2) float32 sub-pixel positions.
+        (N, 3) int32 pixels x, y and scores, row by row, and the (H, W) scores of all pixels, which
+        are undefined in the three outermost.
     """
     image = np.ascontiguousarray(image)
     height, width = image.shape
     border = max(border_px, LEAST_BORDER_PX)
+    scores = np.empty((height, width), np.uint8)
     if height <= 2 * border or width <= 2 * border:
-        return np.empty((0, 3), np.int32), np.empty((0, 2), np.float32)
+        return np.empty((0, 3), np.int32), scores
     # No two peaks touch, hence at most every fourth pixel; what is not written costs no memory.
-    most = ((height + 1) // 2) * ((width + 1) // 2)
-    corners, positions = np.empty((most, 3), np.int32), np.empty((most, 2), np.float32)
-    scores, peaks = np.empty((height, width), np.uint8), np.zeros((width + 7) // 8 * 8, np.uint8)
+    corners = np.empty((((height + 1) // 2) * ((width + 1) // 2), 3), np.int32)
+    peaks = np.zeros((width + 7) // 8 * 8, np.uint8)
     _score_kernel(image, scores)
-    found = _peaks_kernel(scores, threshold, border, peaks, corners, positions)
-    return corners[:found], positions[:found]
+    found = _peaks_kernel(scores, threshold, border, peaks, corners)
+    return corners[:found], scores
+
+
+def refine(corners: NDArray[np.int32], scores: Image) -> NDArray[np.float32]:
+    """Return (N, 2) positions of corners to a fraction of a pixel, by a parabola in each direction.
+
+    Args:
+        corners: (N, 3) peaks as `fast_corners` gives them.
+        scores: (H, W) of all pixels.
+    """
+    x, y = corners[:, 0], corners[:, 1]
+    middle = scores[y, x].astype(np.float32)
+    positions = corners[:, :2].astype(np.float32)
+    for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
+        before, after = scores[y - dy, x - dx], scores[y + dy, x + dx]
+        slope = after.astype(np.float32) - before
+        bend = 2.0 * middle - before - after
+        # Two equal neighbours share the peak, never three in a row without a bend to see.
+        positions[:, axis] += 0.5 * slope / np.maximum(bend, 1.0)
+    return positions
 
 
 @kernel
@@ -99,20 +119,12 @@ def _score_kernel(image: Image, scores: NDArray[np.uint8]) -> None:
 
 
 @kernel
-def _vertex(left: np.uint8, middle: np.uint8, right: np.uint8) -> float:
-    """Where a parabola through three values at −1, 0, 1 has its top."""
-    bend = 2.0 * float(middle) - float(left) - float(right)
-    return 0.5 * (float(right) - float(left)) / bend if bend > 0.0 else 0.0
-
-
-@kernel
 def _peaks_kernel(
     scores: NDArray[np.uint8],
     threshold: int,
     border: int,
     peaks: NDArray[np.uint8],
     corners: NDArray[np.int32],
-    positions: NDArray[np.float32],
 ) -> int:
     """Scores that no neighbour surpasses; of equal neighbours the first in order stays."""
     height, width = scores.shape
@@ -132,8 +144,6 @@ def _peaks_kernel(
                 if peaks[x] == 0:
                     continue
                 corners[found, 0], corners[found, 1], corners[found, 2] = x, y, here[x]
-                positions[found, 0] = x + _vertex(here[x - 1], here[x], here[x + 1])
-                positions[found, 1] = y + _vertex(above[x], here[x], below[x])
                 found += 1
     return found
 

@@ -119,10 +119,10 @@ def search_circles(
 @kernel
 def search_lines(
     first: Words,
-    lines: NDArray[np.float64],
+    lines: NDArray[np.float32],
     second: Words,
-    plane: NDArray[np.float64],
-    limits: NDArray[np.float64],
+    plane: NDArray[np.float32],
+    limits: NDArray[np.float32],
     levels: NDArray[np.uint8],
     ratio: float,
     limit: int,

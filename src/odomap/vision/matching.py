@@ -328,10 +328,10 @@ def match_epipolar(
             plane[apart < EPIPOLE_SIGMAS**2 * variance] = np.nan
         search_lines(
             as_words(first.descriptors[rows]),
-            np.ascontiguousarray(np.cross(t, first.bearings[rows] @ R.T)),
+            np.cross(t, first.bearings[rows] @ R.T).astype(np.float32),
             as_words(second.descriptors[others]),
-            np.ascontiguousarray(plane.T, np.float64),
-            CHI2 * variance,
+            np.ascontiguousarray(plane.T, np.float32),
+            (CHI2 * variance).astype(np.float32),
             levels,
             config.ratio,
             config.max_hamming,

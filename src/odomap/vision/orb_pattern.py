@@ -1,9 +1,9 @@
 """The 256 pairs of points that ORB compares, learned by Rublee et al. for little correlation.
 
-Pair k is (x, y) of a point and (x, y) of another, pixels from the keypoint before rotation; bit k of
-the descriptor is set where the first is darker than the second. The table was measured: random
-patches were described by OpenCV's ORB at angle 0, and for each bit the pair of pixels was looked for
-that predicts it. Vocabularies trained on OpenCV's descriptors therefore serve these as well.
+Pair k is (x, y) of a point and (x, y) of another, pixels from the keypoint before rotation; bit k
+of the descriptor is set where the first is darker than the second. The table was measured: random
+patches were described by OpenCV's ORB at angle 0, and for each bit the pair of pixels was looked
+for that predicts it. Vocabularies trained on OpenCV's descriptors therefore serve these as well.
 
 Reference: Rublee, Rabaud, Konolige, Bradski, "ORB: an efficient alternative to SIFT or SURF", ICCV
 2011, section 4.3.
