@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from odomap.errors import ConfigError
+from odomap.geometry.lie import se3_exp
 from odomap.system.creating import CHECKS, CreateConfig, create_landmarks
 from odomap.system.creating_kernels import judge
 from odomap.vision.matching import MatchConfig
@@ -201,6 +202,16 @@ def test_a_keyframe_alone_makes_nothing():
     assert len(create(window)) == 0
     # nor does one that shares no landmark with any other
     assert len(create(world(known=0.0).window)) == 0
+
+
+def test_poses_a_little_off_make_the_same_points():
+    w = world()
+    xi = 0.001 * np.random.default_rng(0).normal(size=(6, 6))
+    off = replace(w.window, Ts_world_camera=w.window.Ts_world_camera @ se3_exp(xi))
+    created = create(off)
+    seen, point = truth_of(w, created)
+    assert len(created) > 0.95 * len(create(w.window))
+    assert np.mean(seen == point[created.obs_point]) > 0.99
 
 
 @pytest.mark.parametrize("with_depth", [False, True])

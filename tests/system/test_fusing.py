@@ -10,7 +10,6 @@ from odomap.system.fusing import FuseConfig, Fusions, find_fusions, fused
 from odomap.system.joining import join
 from odomap.vision.matching import MatchConfig
 from windowworlds import (
-    CAMERA,
     circle,
     keep_observations,
     row,
@@ -299,7 +298,23 @@ def test_nothing_in_a_window_of_one():
     assert triples(*observations(after)) == triples(*observations(w.window))
 
 
+def test_nothing_where_nothing_is_seen():
+    window = world(row(3)).window
+    empty = keep_observations(window, np.zeros(len(window.obs_keyframe), bool))
+    bare = replace(
+        empty,
+        points_world=np.empty((0, 3)),
+        descriptors=np.empty((0, 32), np.uint8),
+        num_observers=np.empty(0, np.int64),
+    )
+    for nothing in (empty, bare):
+        found = find(nothing)
+        assert len(found.keyframe) == len(found.gone) == 0
+        assert len(fused(nothing, found).obs_keyframe) == 0
+
+
 def test_limits():
     with pytest.raises(ConfigError, match="radius_px"):
         FuseConfig(radius_px=0.0)
-    assert CAMERA.width == 640
+    with pytest.raises(ConfigError, match="max_angle_deg"):
+        FuseConfig(max_angle_deg=200.0)
