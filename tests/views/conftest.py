@@ -1,6 +1,6 @@
 """A synthetic run: a noisy path around a room, its estimates, and a procedural picture."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -105,10 +105,11 @@ def map_view(landmarks: np.ndarray, every: int = 5) -> MapView:
     return MapView(keyframes, landmarks[::10], pairs, shared[kept], len(kept))
 
 
-def growth(n: int) -> Growth:
-    """Half of a loop makes a map, the other half finds it."""
+def growth(every: Sequence[Estimate]) -> Growth:
+    """Half of a loop makes a map; in the other half one keyframe goes for each that comes."""
+    n = len(every)
     k = np.arange(n)
-    keyframes = np.minimum(1 + k // 7, n // 14) - (k % 50 > 40)
+    keyframes = np.minimum(np.cumsum([e.is_keyframe for e in every]), 12)
     memory = 300.0 + 40.0 * np.minimum(k[::10] / n, 0.5)
     return Growth(keyframes, 140 * keyframes, k[::10], memory)
 
@@ -167,4 +168,4 @@ def report() -> Report:
     run = make_report(lost=range(61, 70))
     assert run.points is not None
     counts = {"landmarks_created": 15321, "keyframes_culled": 9}
-    return replace(run, map=map_view(run.points), growth=growth(160), mapping=counts)
+    return replace(run, map=map_view(run.points), growth=growth(run.estimates), mapping=counts)

@@ -73,20 +73,39 @@ def test_an_empty_map_is_a_view_of_nothing() -> None:
     assert view.pairs.shape == (0, 2)
 
 
-@pytest.mark.parametrize("least", [0, 1, 2])
-def test_a_plan_looks_along_the_shortest_axis(report: Report, least: int) -> None:
-    extents = np.array([4.0, 5.0, 6.0])
-    extents[least] = 0.5
+@pytest.mark.parametrize(
+    ("extents", "axes", "title"),
+    [
+        ((4.0, 5.0, 0.5), (0, 1), "From above"),
+        ((0.1, 60.0, 1.2), (0, 1), "From above"),  # a straight road that rises
+        ((3.0, 2.0, 2.5), (0, 1), "From above"),
+        ((0.5, 5.0, 4.0), (1, 2), "From the side"),
+        ((4.0, 0.5, 9.0), (0, 2), "From the side"),
+        ((0.0, 0.0, 0.0), (0, 1), "From above"),
+    ],
+)
+def test_a_plan_is_seen_from_above_unless_the_path_climbs(
+    extents: tuple[float, ...], axes: tuple[int, int], title: str
+) -> None:
     Ts = np.tile(np.eye(4), (30, 1, 1))
     Ts[:, :3, 3] = extents * np.linspace(0, 1, 30)[:, None] ** [1.0, 2.0, 3.0]
     Ts[:, :3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # not the first camera's own world
     place = scene(Trajectory(np.arange(30, dtype=np.int64) * 10**8, Ts), None)
     assert place is not None
-    axes = plan_axes(place)
-    assert sorted((*axes, least)) == [0, 1, 2]
-    assert axes[0] != place.up_axis
+    assert plan_axes(place) == axes
     ax = plan_figure(place, MapView.of(room({0: range(5)}))).axes[0]
-    assert ax.get_title(loc="left") == ("From above" if least == 2 else "From the side")
+    assert ax.get_title(loc="left") == title
+
+
+def test_in_camera_axes_a_side_has_up_upwards() -> None:
+    """A lift, seen by a camera whose first pose is the world: y is down."""
+    Ts = np.tile(np.eye(4), (30, 1, 1))
+    s = np.linspace(0, 1, 30)
+    Ts[:, :3, 3] = np.c_[0.1 * s, -2.0 * np.sin(6 * s), 4.0 * s]
+    place = scene(Trajectory(np.arange(30, dtype=np.int64) * 10**8, Ts), None)
+    assert place is not None
+    assert (place.up_axis, plan_axes(place)) == (1, (2, 1))
+    assert plan_figure(place, MapView.of(room({0: range(5)}))).axes[0].yaxis_inverted()
 
 
 def test_a_plan_shows_map_path_and_truth_to_scale(report_of: Make, report: Report) -> None:
@@ -199,10 +218,10 @@ def test_growth_without_counts_is_memory_alone_or_nothing(report: Report) -> Non
 
 def test_the_section_says_what_is_seen(report: Report) -> None:
     shown = map_section(report)
-    assert "Seen along z, the axis along which the path extends least." in shown
+    assert "Seen from above, along z. Green lines join" in shown
     assert report.map is not None
     assert f"the more they share ({report.map.num_pairs} pairs)" in shown
-    made, left = sum(e.is_keyframe for e in report.estimates), 11
+    made, left = sum(e.is_keyframe for e in report.estimates), 12
     assert f"Keyframes: made, {made}; in the map after the last frame, {left}." in shown
     assert "<td>landmarks created</td>" in shown
     assert ">15,321</td>" in shown
@@ -218,6 +237,14 @@ def test_a_loaded_map_is_told_from_what_was_made(report: Report) -> None:
     assert report.growth is not None
     loaded = replace(report.growth, keyframes=report.growth.keyframes + 40)
     assert "Keyframes: in the map before, 40; made," in map_section(replace(report, growth=loaded))
+
+
+def test_a_start_of_two_views_makes_two_keyframes(report: Report) -> None:
+    estimates = [replace(e, is_keyframe=k in (3, 5)) for k, e in enumerate(report.estimates[:8])]
+    counts = np.array([0, 0, 0, 2, 2, 2, 1, 1])  # one is culled as another is made, one later
+    growth = Growth(counts, counts, np.zeros(0, np.int64), np.zeros(0))
+    assert growth.made(estimates).tolist() == [0, 0, 0, 2, 2, 3, 3, 3]
+    assert growth.before(estimates) == 0
 
 
 def test_nothing_told_is_no_section(report: Report) -> None:

@@ -55,15 +55,16 @@ def _panels(estimates: Sequence[Estimate], growth: Growth) -> list[_Panel]:
     t = seconds(estimates)
     panels = []
     if len(t) and len(growth.keyframes) == len(t):
-        made = growth.before(estimates) + np.cumsum([e.is_keyframe for e in estimates])
+        made = growth.before(estimates) + growth.made(estimates)
         panels.append(
             _Panel("Keyframes", t, growth.keyframes.astype(np.float64), made.astype(np.float64))
         )
         panels.append(_Panel("Landmarks", t, growth.landmarks.astype(np.float64)))
     inside = growth.memory_frames < len(t)
     if inside.any() and (growth.memory_mb[inside] > 0).all():
-        at = t[growth.memory_frames[inside]]
-        panels.append(_Panel("Memory held [MB]", at, growth.memory_mb[inside]))
+        memory = growth.memory_mb[inside]
+        at = np.r_[t[growth.memory_frames[inside]], t[-1]]
+        panels.append(_Panel("Memory held [MB]", at, np.r_[memory, memory[-1]]))
     return panels
 
 

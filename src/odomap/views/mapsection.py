@@ -26,14 +26,16 @@ def _plan(report: Report) -> str:
     from odomap.views.style import figure_svg
 
     axes = plan_axes(place)
-    least = AXES[next(k for k in range(3) if k not in axes)]
-    where = "the side" if place.up_axis in axes else "above"
+    along = AXES[next(k for k in range(3) if k not in axes)]
+    is_side = place.up_axis in axes
+    where = "the side" if is_side else "above"
+    why = ", the axis along which the path extends least" if is_side else ""
     against = " and the truth" if place.truth is not None else ""
     svg = figure_svg(
         plan_figure(place, view, report.unit),
         f"Landmarks, keyframes, the path{against}, from {where}",
     )
-    caption = f"Seen along {least}, the axis along which the path extends least. {_joined(view)}"
+    caption = f"Seen from {where}, along {along}{why}. {_joined(view)}"
     return f"<figure>{svg}<figcaption>{text(caption)}</figcaption></figure>"
 
 
@@ -74,7 +76,7 @@ def _grown(report: Report, growth: Growth) -> str:
     """Say what became of the keyframes that were made."""
     there = growth.before(report.estimates)
     before = f"in the map before, {there:,}; " if there else ""
-    made = sum(e.is_keyframe for e in report.estimates)
+    made = int(growth.made(report.estimates)[-1])
     left = int(growth.keyframes[-1])
     return (
         f"Keyframes: {before}made, {made:,}; in the map after the last frame, {left:,}. "

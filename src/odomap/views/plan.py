@@ -1,7 +1,7 @@
 """The plan of a map: landmarks, keyframes and what joins them, the path and the truth.
 
-A plan shows the two axes along which the path extends most, so it is seen along the third: from
-above as a rule, from the side where the camera rather climbed. The picture reaches as far as nearly
+A plan is seen from above, or, where the path climbs more than it wanders, along the axis along
+which it extends least. The picture reaches as far as nearly
 all landmarks do, but not to the few badly triangulated ones that would press the rest into a dot.
 Thousands of dots and lines are one drawing element each kind, which keeps a page small.
 """
@@ -31,23 +31,27 @@ REACH = 10.0
 USUAL = 3.0
 """Percent of the landmarks at either end of an axis that the picture need not reach."""
 
+CLIMBS, WANDERS = 0.3, 1.5
+"""Height over the greater and the lesser horizontal extent, from which on a path climbs."""
+
 ALPHAS = (0.16, 0.28, 0.42, 0.6)
 """How strongly a pair of keyframes is joined: each step is twice as many landmarks shared."""
 
 
 def plan_axes(place: Scene) -> tuple[int, int]:
-    """Return the two axes along which a path extends most, the one drawn to the right first.
+    """Return the axes drawn to the right and upwards: the ground, or a side of a path that climbs.
 
-    Of axes that extend alike the horizontal ones are taken.
+    A path climbs if its height changes by a good part of its length and clearly more than the
+    lesser of its horizontal extents: a straight road that rises is still seen from above.
     """
-    extents = np.ptp(place.positions, axis=0)
-    least = min(range(3), key=lambda k: (round(float(extents[k]), 3), k != place.up_axis))
-    a, b = (k for k in range(3) if k != least)
-    return (b, a) if a == place.up_axis else (a, b)
+    extents, up = np.ptp(place.positions, axis=0), place.up_axis
+    lesser, greater = sorted(place.ground, key=lambda k: float(extents[k]))
+    climbs = extents[up] > max(CLIMBS * extents[greater], WANDERS * extents[lesser])
+    return (greater, up) if climbs else place.ground
 
 
 def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
-    """Draw a map, seen along the axis along which the path extends least.
+    """Draw a map from above, or from the side where the path climbs.
 
     Args:
         place: the path, and its truth.

@@ -71,6 +71,12 @@ class Growth:
         """Return how many keyframes the map had before the first frame, as one loaded has."""
         return int(self.keyframes[0]) - bool(estimates[0].is_keyframe)
 
+    def made(self, estimates: Sequence[Estimate]) -> NDArray[np.int64]:
+        """Return how many keyframes were made up to each frame (N,); one may make several."""
+        marked = np.array([e.is_keyframe for e in estimates], np.int64)
+        more = np.diff(self.keyframes, prepend=self.keyframes[:1] - marked[:1])
+        return np.cumsum(np.maximum(marked, more))
+
 
 def environment() -> dict[str, str]:
     """Describe what a run ran on: versions of what decides its numbers, system, cores."""
