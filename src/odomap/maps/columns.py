@@ -68,7 +68,7 @@ def distinct_in_order(values: NDArray[S]) -> NDArray[S]:
     return np.asarray(values[np.sort(first)])
 
 
-def members(values: NDArray[np.int64]) -> NDArray[np.int64]:
+def members(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.int64]:
     """Return the distinct values of (N,) row numbers, ascending, in O(N + largest)."""
     is_member = np.zeros(int(values.max(initial=-1)) + 1, np.bool_)
     is_member[values] = True

@@ -255,6 +255,6 @@ class Map(Surroundings):
     def _drop_observations_of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Remove all observations of keyframes, and return the slots of what they saw."""
         _, rows = self._observations.of_keyframes(keyframes)
-        slots = self._observations.read(rows)[1]
+        slots = self._observations.seen(rows)
         self._observations.remove(rows)
         return slots

@@ -98,6 +98,16 @@ class Observations:
             self._keypoint[rows].astype(np.int64),
         )
 
+    def observers(
+        self, rows: NDArray[np.int64] | NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return the (N,) keyframes and keypoints of (N,) rows."""
+        return self._keyframe.take(rows), self._keypoint.take(rows)
+
+    def seen(self, rows: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the (N,) landmark slots of (N,) rows."""
+        return self._landmark.take(rows).astype(np.int64)
+
     def of_keyframes(
         self, keyframes: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

@@ -37,7 +37,7 @@ class Surroundings(Sightings):
         with self.lock:
             slots = distinct(self._landmarks.slots(self._ids(landmark_ids)))
             _, rows = self._observations.of_landmarks(slots[slots >= 0])
-            keyframes = self._observations.read(rows)[0]
+            keyframes = self._observations.observers(rows)[0]
         counts = np.bincount(keyframes)
         ids = np.flatnonzero(counts)
         order = np.argsort(-counts[ids], kind="stable")
@@ -47,7 +47,7 @@ class Surroundings(Sightings):
         """Return the (n,) distinct landmarks that keyframes see, ascending; stubs see none."""
         with self.lock:
             _, rows = self._observations.of_keyframes(self._all_known(keyframe_ids))
-            seen = self._landmarks.ids[members(self._observations.read(rows)[1])]
+            seen = self._landmarks.ids[members(self._observations.seen(rows))]
         return np.sort(seen)
 
     def near(
@@ -95,18 +95,18 @@ class Surroundings(Sightings):
         slots = members(slots[slots >= 0])
         slots = slots[np.argsort(self._landmarks.ids[slots])]
         indptr, rows = self._observations.of_landmarks(slots)
-        observers, _, keypoints = self._observations.read(rows)
-        anchors = self._landmarks.anchor[slots].astype(np.int64)
+        observers, keypoints = self._observations.observers(rows)
+        anchors = self._landmarks.anchor.take(slots)
         keyframes = members(np.concatenate([anchors, observers]))
         index = np.zeros(int(keyframes.max(initial=-1)) + 1, np.int64)
         index[keyframes] = np.arange(len(keyframes))
         return ViewRows(
-            ids=self._landmarks.ids[slots],
-            anchor=index[anchors],
-            p_anchor=self._landmarks.p_anchor[slots],
-            descriptors=self._landmarks.descriptor[slots],
+            ids=self._landmarks.ids.take(slots),
+            anchor=index.take(anchors),
+            p_anchor=self._landmarks.p_anchor.take(slots),
+            descriptors=self._landmarks.descriptor.take(slots),
             indptr=indptr,
-            observer=index[observers],
+            observer=index.take(observers),
             keypoint=keypoints,
             keyframes=[self._keyframes[k] for k in keyframes.tolist()],
             placements=self.states.placements(keyframes),

@@ -26,6 +26,8 @@ from odomap.maps.states import Placement, act
 
 __all__ = ["LandmarkViews", "ViewRows", "views_from"]
 
+_NONE = np.zeros(0, np.uint8)
+
 
 @dataclass(frozen=True, eq=False)
 class LandmarkViews:
@@ -73,7 +75,7 @@ class ViewRows:
     descriptors: NDArray[np.uint8]
     indptr: NDArray[np.int64]
     observer: NDArray[np.int64]
-    keypoint: NDArray[np.int64]
+    keypoint: NDArray[np.int32]
     keyframes: Sequence[Keyframe]
     placements: Placement
 
@@ -150,16 +152,14 @@ def _references(rows: ViewRows, landmark: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def _levels(
-    keyframes: Sequence[Keyframe], observer: NDArray[np.int64], keypoint: NDArray[np.int64]
+    keyframes: Sequence[Keyframe], observer: NDArray[np.int64], keypoint: NDArray[np.int32]
 ) -> NDArray[np.uint8]:
     """Return the pyramid levels of N keypoints, 0 where there is none."""
-    order = np.argsort(observer, kind="stable")
-    bounds = np.searchsorted(observer[order], np.arange(len(keyframes) + 1)).tolist()
+    levels = [_NONE if k.features is None else k.features.level for k in keyframes]
+    counts = np.array([len(column) for column in levels], np.int64)
+    known = np.flatnonzero((keypoint >= 0) & (keypoint < counts[observer]))
     level = np.zeros(len(observer), np.uint8)
-    for n, keyframe in enumerate(keyframes):
-        chosen = order[bounds[n] : bounds[n + 1]]
-        features = keyframe.features
-        if features is not None and len(chosen):
-            known = chosen[(keypoint[chosen] >= 0) & (keypoint[chosen] < len(features))]
-            level[known] = features.level[keypoint[known]]
+    if len(known):
+        rows = offsets(counts)[observer[known]] + keypoint[known]
+        level[known] = np.concatenate(levels)[rows]
     return level
