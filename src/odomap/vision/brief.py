@@ -110,7 +110,7 @@ def _centroid(image: Image, x: int, y: int, arms: NDArray[np.int32]) -> float:
             grey = np.int32(row[u])
             mx += arms[0, v, u] * grey
             my += arms[1, v, u] * grey
-    return np.arctan2(float(my), float(mx))
+    return float(np.arctan2(float(my), float(mx)))
 
 
 @kernel

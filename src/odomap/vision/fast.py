@@ -28,6 +28,8 @@ Image = NDArray[np.uint8]
 
 LEAST_BORDER_PX = 4
 """The circle and one neighbour reach this far."""
+MOST_PX = 0.49
+"""A refined position is not farther from its pixel."""
 
 
 def fast_corners(
@@ -72,8 +74,8 @@ def refine(corners: NDArray[np.int32], scores: Image) -> NDArray[np.float32]:
         before, after = scores[y - dy, x - dx], scores[y + dy, x + dx]
         slope = after.astype(np.float32) - before
         bend = 2.0 * middle - before - after
-        # Two equal neighbours share the peak, never three in a row without a bend to see.
-        positions[:, axis] += 0.5 * slope / np.maximum(bend, 1.0)
+        # Where two neighbours are equal the top is half way: rounding is to give this pixel again.
+        positions[:, axis] += np.clip(0.5 * slope / np.maximum(bend, 1.0), -MOST_PX, MOST_PX)
     return positions
 
 

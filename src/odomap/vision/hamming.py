@@ -54,7 +54,7 @@ def hamming(a: NDArray[np.uint64], i: int, b: NDArray[np.uint64], j: int) -> int
             (x >> np.uint64(2)) & np.uint64(0x3333333333333333)
         )
         x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-        total += np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+        total += int((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
     return total
 
 

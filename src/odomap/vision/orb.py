@@ -4,7 +4,7 @@ The image is reduced level by level by a factor of 1.2. On each level FAST corne
 by cell, so that every region gets its share and what poor cells cannot use goes to the others; weak
 corners are only admitted to cells without strong ones. Of its corners a cell prefers those with the
 best FAST scores: they were found again more often than those of the best Harris response. Levels
-map to the image by pixel centres, x = (x_l + ½) w / w_l − ½, and positions are fractions of a pixel.
+map to the image by pixel centres, x = (x_l + ½) w / w_l − ½; positions are fractions of a pixel.
 
 Cost: O(pixels); 1000 features of 752x480 pixels in 8 ms on one core.
 
@@ -162,7 +162,8 @@ def _pyramid(image: Image, levels: int, scale: float) -> list[Image]:
 
 def _ratio(image: Image, small: Image) -> NDArray[np.float32]:
     """Return the pixels of the image per pixel of the level, along x and y."""
-    return np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]], np.float32)
+    height, width = small.shape
+    return np.array([image.shape[1] / max(width, 1), image.shape[0] / max(height, 1)], np.float32)
 
 
 def _shares(config: OrbConfig, levels: int) -> list[int]:
