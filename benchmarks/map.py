@@ -57,7 +57,9 @@ def described(id: int, count: int) -> Keyframe:
     return Keyframe(id, id, features=Features(keypoints, looks, nothing, nothing[:, 0], level))
 
 
-def street(keyframes: int, landmarks: int, observations: int, seed: int = 0) -> Map:
+def street(
+    keyframes: int, landmarks: int, observations: int, seed: int = 0, *, described_too: bool = False
+) -> Map:
     """Return a map in which each keyframe sees landmarks from a stretch of the street."""
     rng = np.random.default_rng(seed)
     m = Map()
@@ -65,7 +67,8 @@ def street(keyframes: int, landmarks: int, observations: int, seed: int = 0) -> 
     for k in range(keyframes):
         T = np.eye(4)
         T[0, 3] = k
-        m.add_keyframe(described(m.new_keyframe_id(), each), T, covariance=np.eye(6))
+        keyframe = described(k, each) if described_too else Keyframe(k, k)
+        m.add_keyframe(keyframe, T, covariance=np.eye(6))
     anchors = np.arange(landmarks) * keyframes // landmarks
     ids = m.add_landmarks(anchors, rng.normal(size=(landmarks, 3)))
     stretch = 4 * each
@@ -217,7 +220,7 @@ def main() -> None:
     parser.add_argument("--landmarks", type=int, default=200_000)
     parser.add_argument("--observations", type=int, default=1_000_000)
     size = parser.parse_args()
-    m = street(size.keyframes, size.landmarks, size.observations)
+    m = street(size.keyframes, size.landmarks, size.observations, described_too=True)
     sizes = m.num_keyframes, m.num_landmarks, m.num_observations
     print("{} keyframes, {} landmarks, {} observations".format(*sizes))
     print(f"{'':<44}{'call':>9}{'max':>9}{'hold':>9}{'max':>9}   ms")

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 
@@ -12,10 +13,11 @@ from hypothesis import settings
 from hypothesis.stateful import precondition, rule
 
 import odomap
-from maps.test_map_properties import MapMachine
-from mapworlds import Walk, rich_map, same_map
+from maps.test_map_properties import MapMachine, random_pose
+from mapworlds import Walk, features, rich_map, same_map
 from odomap.errors import InputError, OutputError
 from odomap.files.mapfile import MapFile, load_map, read_map_rig, save_map
+from odomap.maps import copying
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 
@@ -107,6 +109,83 @@ def test_maps_of_odometry(tmp_path, kind):
     rig = read_map_rig(tmp_path / "a.odomap")
     for mount, given in zip(rig.cameras, source.rig.cameras, strict=True):
         np.testing.assert_array_equal(mount.T_body_camera.matrix, given.T_body_camera.matrix)
+
+
+def slam_map(keyframes, count):
+    """A map as SLAM leaves it: every keyframe with features, and landmarks that look like them."""
+    rng = np.random.default_rng(0)
+    m = Map()
+    for n in range(keyframes):
+        seen = features(rng, count, 32)
+        m.add_keyframe(
+            Keyframe(m.new_keyframe_id(), 50_000_000 * n, features=seen), random_pose(rng)
+        )
+        at = np.flatnonzero(np.isfinite(seen.depth))[: count // 4]
+        points = seen.bearings[at] * seen.depth[at, None]
+        ids = m.add_landmarks(n, points, seen.descriptors[at])
+        m.add_observations(n, ids, at)
+        older = m.landmark_ids[-count : -len(at)][: count - len(at)]
+        m.add_observations(n, older, np.setdiff1d(np.arange(count), at)[: len(older)])
+        m.count_expected(np.r_[ids, older])
+        m.count_seen(ids)
+        m.set_descriptors(ids[:3], seen.descriptors[:3])
+        m.fuse_landmarks(older[:2], ids[: len(older[:2])])
+    m.cull_keyframes([2, 5, 9])
+    return m
+
+
+def test_a_map_of_slam_with_features_on_every_keyframe(tmp_path):
+    m = slam_map(40, 300)
+    file = tmp_path / "a.odomap"
+    save_map(file, m)
+    again = load_map(file)
+    same_map(m, again)
+    save_map(tmp_path / "b.odomap", again)
+    assert file.read_bytes() == (tmp_path / "b.odomap").read_bytes()
+    assert file.stat().st_size < 37 * 300 * 73 + 110 * m.num_landmarks + 20 * m.num_observations
+    ids, mount = m.landmark_ids, np.eye(4)
+    for before, after in zip(
+        vars(m.views_of(ids, mount)).values(), vars(again.views_of(ids, mount)).values()
+    ):
+        np.testing.assert_array_equal(before, after)
+    assert m.views_of(ids, mount).level.max() == 7
+    with MapFile(file) as opened:
+        np.testing.assert_array_equal(opened.features(7).level, m.keyframe(7).features.level)
+
+
+def test_what_is_saved_beside_a_mapper_is_of_one_moment(tmp_path, monkeypatch):
+    monkeypatch.setattr(copying, "STEP", 4096)
+    m, errors, stop = slam_map(12, 80), [], threading.Event()
+
+    def work():
+        rng = np.random.default_rng(1)
+        try:
+            while not stop.is_set():
+                with m.lock:  # a landmark, its observation and its counts come together
+                    k = m.new_keyframe_id()
+                    m.add_keyframe(Keyframe(k, k, features=features(rng, 4, 32)), random_pose(rng))
+                    ids = m.add_landmarks(k, rng.normal(size=(4, 3)))
+                    m.add_observations(k, ids, np.arange(4))
+                    m.count_expected(ids)
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    sizes = []
+    for _ in range(6):
+        save_map(tmp_path / "m.odomap", m)
+        again = load_map(tmp_path / "m.odomap")
+        for k in again.keyframe_ids[again.keyframe_ids >= 12].tolist():
+            ids, keypoints = again.observations_of(k)
+            assert keypoints.tolist() == [0, 1, 2, 3]
+            assert again.expected(ids).tolist() == [1, 1, 1, 1]
+        sizes.append(again.num_keyframes)
+    stop.set()
+    thread.join()
+    assert not errors
+    assert sizes == sorted(sizes)
+    assert sizes[-1] > sizes[0]
 
 
 def test_opening_reads_little_and_features_come_alone(tmp_path):
@@ -202,9 +281,9 @@ while True:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_kill_9_during_a_save_leaves_a_whole_file(tmp_path):
-    wholes = []
-    for seed in (1, 2):
-        save_map(tmp_path / f"{seed}.odomap", rich_map(seed, 40))
+    wholes, rng = [], np.random.default_rng(0)
+    for seed, m in ((1, rich_map(1, 40)), (2, slam_map(30, 500))):
+        save_map(tmp_path / f"{seed}.odomap", m)
         wholes.append((tmp_path / f"{seed}.odomap").read_bytes())
     file = tmp_path / "m.odomap"
     file.write_bytes(wholes[0])
@@ -214,7 +293,9 @@ def test_kill_9_during_a_save_leaves_a_whole_file(tmp_path):
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
         assert process.stdout.readline() == b"ready\n"
         while not any(p.name.endswith(f".{process.pid}.part") for p in tmp_path.iterdir()):
-            time.sleep(0.001 * (attempt + 1))
+            time.sleep(0.001)
+        if attempt % 2:  # anywhere; else as soon as a save is seen to go on
+            time.sleep(rng.uniform(0.0, 0.1))
         process.kill()
         process.wait()
         process.stdout.close()
