@@ -27,7 +27,7 @@ def opencv(image):
 
 
 def found_again(first, second, shape):
-    """Return distinct places (5 px) and cells of the image with matches on one epipolar geometry."""
+    """Return distinct places (5 px) and cells of the image that fit one epipolar geometry."""
     match = match_all(first[1], second[1], MatchConfig())
     hit = match >= 0
     a, b = first[0][hit].astype(float), second[0][match[hit]].astype(float)

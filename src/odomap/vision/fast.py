@@ -67,16 +67,29 @@ def refine(corners: NDArray[np.int32], scores: Image) -> NDArray[np.float32]:
         corners: (N, 3) peaks as `fast_corners` gives them.
         scores: (H, W) of all pixels.
     """
-    x, y = corners[:, 0], corners[:, 1]
-    middle = scores[y, x].astype(np.float32)
-    positions = corners[:, :2].astype(np.float32)
-    for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
-        before, after = scores[y - dy, x - dx], scores[y + dy, x + dx]
-        slope = after.astype(np.float32) - before
-        bend = 2.0 * middle - before - after
-        # Where two neighbours are equal the top is half way: rounding is to give this pixel again.
-        positions[:, axis] += np.clip(0.5 * slope / np.maximum(bend, 1.0), -MOST_PX, MOST_PX)
+    positions = np.empty((len(corners), 2), np.float32)
+    _refine_kernel(corners, scores, positions)
     return positions
+
+
+@kernel
+def _vertex(left: np.uint8, middle: np.uint8, right: np.uint8) -> float:
+    """Where a parabola through three values at −1, 0, 1 has its top."""
+    bend = max(2.0 * middle - left - right, 1.0)
+    # Where two neighbours are equal the top is half way: rounding is to give this pixel again.
+    return float(min(max(0.5 * (float(right) - float(left)) / bend, -MOST_PX), MOST_PX))
+
+
+@kernel
+def _refine_kernel(
+    corners: NDArray[np.int32], scores: Image, positions: NDArray[np.float32]
+) -> None:
+    """The top of a parabola along each axis."""
+    for i in range(len(corners)):
+        x, y = corners[i, 0], corners[i, 1]
+        middle = scores[y, x]
+        positions[i, 0] = x + _vertex(scores[y, x - 1], middle, scores[y, x + 1])
+        positions[i, 1] = y + _vertex(scores[y - 1, x], middle, scores[y + 1, x])
 
 
 @kernel
@@ -152,4 +165,4 @@ def _peaks_kernel(
 
 def warm_up() -> None:
     """Compile the kernels of this module."""
-    fast_corners(np.zeros((16, 16), np.uint8), 20)
+    refine(*fast_corners(np.zeros((16, 16), np.uint8), 20))
