@@ -12,6 +12,7 @@ from odomap.maps.map import Map
 from odomap.system.association import Candidates, Reference, View
 from odomap.system.candidates import CandidateConfig, Followed, Follower, no_candidates
 from odomap.system.config import preset
+from odomap.system.depthbias import DepthBias
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.vision.features import Corners, Features
@@ -19,6 +20,8 @@ from odomap.vision.features import Corners, Features
 CAMERA = Camera(intrinsics=(300.0, 300.0, 199.5, 149.5), resolution=(400, 300))
 T_BODY_CAMERA = se3_exp(np.array([0.05, -0.02, 0.1, 0.2, -0.4, 0.1]))
 CONFIG = CandidateConfig(follow=True)
+
+NO_BIAS = DepthBias(np.zeros(3))
 
 
 def view_of(frame_id):
@@ -29,6 +32,8 @@ def view_of(frame_id):
 
 class Oracle:
     """An association that knows where points are: it answers for what is near its guess."""
+
+    count = 300
 
     def __init__(self, points, poses, reach_px=15.0):
         self.points, self.poses, self.reach_px = points, poses, reach_px
@@ -52,6 +57,9 @@ class Oracle:
 
     def extend(self, view, occupied, count):
         return np.empty((0, 2)), np.empty((0, 0), np.uint8)
+
+    def levels_at(self, view, keypoints):
+        return np.zeros(len(keypoints), np.uint8)
 
     def descriptors_at(self, view, keypoints):
         return np.empty((len(keypoints), 0), np.uint8)
@@ -244,7 +252,7 @@ class Line:
         self.config = replace(config, tracking=replace(config.tracking, association="descriptors"))
         eye = replace(Eye.of_camera(CAMERA), T_body_camera=T_BODY_CAMERA)
         self.map = self.walk.map
-        self.keyframes = Keyframes(self.map, eye, None, self.walk.oracle, self.config)
+        self.keyframes = Keyframes(self.map, eye, None, NO_BIAS, self.walk.oracle, self.config)
         pixels = self.walk.oracle.at(0)
         points = np.array(self.walk.points)
         points[20:] = np.nan  # half of them have a place from the start
@@ -329,7 +337,7 @@ def test_without_following_there_are_none(follow):
     line = Line(step=0.1, views=2)
     config = replace(line.config, candidates=replace(CONFIG, follow=follow))
     eye = replace(Eye.of_camera(CAMERA), T_body_camera=T_BODY_CAMERA)
-    keyframes = Keyframes(line.map, eye, None, line.walk.oracle, config)
+    keyframes = Keyframes(line.map, eye, None, NO_BIAS, line.walk.oracle, config)
     rows = np.arange(len(line.reference.landmark_ids))
     seen = keyframes.measure(
         None,

@@ -8,6 +8,7 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.system.depthbias import DepthBias
 from odomap.system.mapping import WindowConfig, WindowMapper
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.features import Features
@@ -29,7 +30,9 @@ class Walk:
         self.id_of = np.full(len(self.points), -1)
         window = WindowConfig() if window is None else window
         config = BundleConfig(iterations=8)
-        self.mapper = WindowMapper(self.map, T_BODY_CAMERA, CAMERA, window, config, NOISE, SIGMA)
+        bias = DepthBias(np.zeros(3))
+        sections = window, config, NOISE, bias
+        self.mapper = WindowMapper(self.map, T_BODY_CAMERA, CAMERA, *sections, SIGMA)
         self.truth = []
 
     def step(self, far=False):

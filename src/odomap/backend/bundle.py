@@ -107,14 +107,8 @@ class Bundle:
             named = getattr(self, name)
             if n and not 0 <= named.min() <= named.max() < len(known):
                 raise InputError(f"bundle: an observation names a {name} that does not exist")
-        for name in (
-            "Ts_world_body",
-            "points_world",
-            "Ts_camera_body",
-            "baselines",
-            "xy",
-            "weights",
-        ):
+        real = "Ts_world_body", "points_world", "Ts_camera_body", "baselines", "xy", "weights"
+        for name in real:
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(f"bundle: {name} holds a value that is not finite")
         if np.isinf(self.disparity).any():
@@ -139,6 +133,9 @@ class BundleSolution:
             image. What errors of the calibration would do.
         variance_factor: χ² per degree of freedom of the inlying observations: about 1 where the
             weights say the truth.
+        disparity_gradient: (3,) of the cost by those errors, at the solution.
+        disparity_curvature: (3, 3) of the cost by those errors, with poses and points following:
+            the observations ask for errors of −curvature⁻¹ gradient.
     """
 
     Ts_world_body: Array
@@ -152,6 +149,8 @@ class BundleSolution:
     joint_covariance: Array
     disparity_responses: Array
     variance_factor: float
+    disparity_gradient: Array
+    disparity_curvature: Array
 
 
 def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSolution:
@@ -175,7 +174,7 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
     poses, cameras, seen = _arrays(bundle, order)
     points = np.array(bundle.points_world, np.float64, order="C")
     chi2, joint, costs = np.empty(len(order)), np.zeros((6 * free, 6 * free)), np.zeros(2)
-    response = np.zeros((3, 6 * free))
+    response, evidence = np.zeros((3, 6 * free)), np.zeros((4, 3))
     tried, why = _solve_kernel(
         poses,
         points,
@@ -185,6 +184,7 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
         chi2,
         joint,
         response,
+        evidence,
         costs,
     )
     Ts = np.array(bundle.Ts_world_body)
@@ -209,6 +209,8 @@ def solve_bundle(bundle: Bundle, config: BundleConfig | None = None) -> BundleSo
         joint,
         responses,
         factor,
+        evidence[0],
+        evidence[1:],
     )
 
 
@@ -308,6 +310,7 @@ def _solve_kernel(
     chi2: Array,
     joint: Array,
     response: Array,
+    evidence: Array,
     costs: Array,
 ) -> tuple[int, int]:
     """Levenberg-Marquardt, poses and points in place; returns steps tried and a reason's index."""
@@ -357,11 +360,15 @@ def _solve_kernel(
         _hold_scale(poses, system.S)
     if factor(system.S):
         invert(system.S, joint)
-        disparity_response(poses, points, cameras, seen, width, system, response)
+        disparity_response(poses, points, cameras, seen, width, system, response, evidence)
+        pulls = response.copy()
         for e in range(3):
             for a in range(size):
                 response[e, a] = -response[e, a]
             solve(system.S, response[e])
+            for d in range(3):
+                for a in range(size):
+                    evidence[1 + d, e] += pulls[d, a] * response[e, a]
     else:
         reason = 3
     return tried, reason

@@ -198,15 +198,20 @@ def disparity_response(
     width: float,
     system: SystemArrays,
     response: Array,
+    evidence: Array,
 ) -> None:
     """Write g (3, 6F), gradients of the reduced problem per unit of error in all disparities.
 
     The error is an offset, or a slope in x or y: δ(x, y) = 1, x, y. With ∂r/∂δ = (0, 0, −w_d δ) it
     adds a = Σ Jᵀ w ∂r/∂δ and c = Σ Pᵀ w ∂r/∂δ, so that g = a − W C⁻¹ c and poses move by −S⁻¹ g.
+
+    What the observations say about the error itself goes into `evidence` (4, 3): the gradient of
+    the cost, Σ w r ∂r/∂δ, and its curvature with landmarks eliminated, Σ w ∂r/∂δ² − cᵀ C⁻¹ c.
     """
     r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
     c, shape = np.empty((3, 3)), np.ones(3)
     response[:, :] = 0.0
+    evidence[:, :] = 0.0
     for m in range(len(points)):
         c[:, :] = 0.0
         for o in range(seen.start[m], seen.start[m + 1]):
@@ -230,11 +235,21 @@ def disparity_response(
             shape[1], shape[2] = seen.xy[o, 0], seen.xy[o, 1]
             for e in range(3):
                 pull = -w * seen.weight[o, 1] * shape[e]
+                evidence[0, e] += pull * r[2]
+                for d in range(3):
+                    evidence[1 + e, d] -= pull * seen.weight[o, 1] * shape[d]
                 for a in range(3):
                     c[e, a] += pull * P[2, a]
                 if f >= 0:
                     for a in range(6):
                         response[e, 6 * f + a] += pull * J[2, a]
+        for e in range(3):
+            for b in range(3):
+                y = 0.0
+                for a in range(3):
+                    y += system.C_inverse[m, b, a] * c[e, a]
+                for d in range(3):
+                    evidence[1 + d, e] -= y * c[d, b]
         for o in range(seen.start[m], seen.start[m + 1]):
             f = 6 * poses.column[seen.pose[o]]
             if f < 0:
@@ -313,4 +328,5 @@ def warm_up() -> None:
     robust_cost(poses, points, cameras, seen, 2.5, np.empty(1))
     reduced_system(poses, points, cameras, seen, 2.5, 1.0, system)
     back_substitute(poses, seen, system, points, np.empty((1, 3)))
-    disparity_response(poses, points, cameras, seen, 2.5, system, np.empty((3, 6)))
+    response, evidence = np.empty((3, 6)), np.empty((4, 3))
+    disparity_response(poses, points, cameras, seen, 2.5, system, response, evidence)

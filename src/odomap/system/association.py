@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.limits import Count, Fraction, Limits, NotNegative, check_limits
-from odomap.vision.features import Corners, FeatureConfig, describe, detect
+from odomap.vision.features import Corners, FeatureConfig, detect
 from odomap.vision.flow import FlowConfig, pyramid, track
 from odomap.vision.matching import MatchConfig, match_guided
+from odomap.vision.orb import OrbConfig, describe_at, extract
 
 __all__ = [
     "Association",
@@ -30,6 +31,9 @@ __all__ = [
 ]
 
 Image = NDArray[np.uint8]
+
+_AS_ONE = np.array([1.0, 1j])
+"""Makes one number of a pixel, which can be looked up."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,14 @@ class Reference:
 
 
 class Association(Protocol):
-    """Finds landmarks in images."""
+    """Finds landmarks in images.
+
+    Attributes:
+        count: features wanted per keyframe.
+    """
+
+    @property
+    def count(self) -> int: ...  # noqa: D102 (see the class)
 
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
         """Make a rectified image ready."""
@@ -190,6 +201,10 @@ class Association(Protocol):
         """Return the descriptors (n, D) to store with keypoints tracked into a view."""
         ...
 
+    def levels_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the pyramid levels (n,) of keypoints of a view."""
+        ...
+
 
 @dataclass(frozen=True)
 class FlowAssociation:
@@ -198,6 +213,12 @@ class FlowAssociation:
     features: FeatureConfig
     flow: FlowConfig
     mask: NDArray[np.bool_]
+    describes: bool = False
+
+    @property
+    def count(self) -> int:
+        """Features wanted per keyframe."""
+        return self.features.count
 
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
         """Build the pyramid."""
@@ -224,27 +245,41 @@ class FlowAssociation:
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Detect corners."""
         corners = detect(view.image, self.features, count, occupied.astype(np.float32), self.mask)
-        return corners.keypoints.astype(np.float64), np.empty((len(corners.keypoints), 0), np.uint8)
+        points = corners.keypoints.astype(np.float64)
+        return points, self.descriptors_at(view, points)
 
     def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Return none: patches are compared, not descriptors."""
-        return np.empty((len(keypoints), 0), np.uint8)
+        """Describe keypoints for the map; to follow them patches are compared, not descriptors."""
+        if not self.describes:
+            return np.empty((len(keypoints), 0), np.uint8)
+        described, kept = describe_at(view.image, keypoints.astype(np.float32))
+        descriptors = np.zeros((len(keypoints), 32), np.uint8)  # at the rim there is no patch
+        descriptors[kept] = described
+        return descriptors
+
+    def levels_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return zeros: points are followed on the finest level."""
+        return np.zeros(len(keypoints), np.uint8)
 
 
 @dataclass(frozen=True)
 class DescriptorAssociation:
-    """Detects, describes and matches; see the module."""
+    """Finds features on all levels of a pyramid, and matches them; see the module."""
 
-    features: FeatureConfig
+    orb: OrbConfig
     matching: MatchConfig
     mask: NDArray[np.bool_]
 
+    @property
+    def count(self) -> int:
+        """Features wanted per keyframe."""
+        return self.orb.count
+
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
-        """Detect and describe; more than a keyframe needs, since not every feature repeats."""
-        corners = detect(image, self.features, 2 * self.features.count, None, self.mask)
-        descriptors, kept = describe(image, corners, self.features.detector)
-        corners = Corners(corners.keypoints[kept], corners.strength[kept], corners.level[kept])
-        return View(frame_id, stamp_ns, (image,), corners, descriptors)
+        """Find and describe features."""
+        found = extract(image, self.orb, self.mask)
+        corners = Corners(found.keypoints, found.strength, found.level)
+        return View(frame_id, stamp_ns, (image,), corners, found.descriptors)
 
     def find(
         self,
@@ -272,17 +307,22 @@ class DescriptorAssociation:
         self, view: View, occupied: NDArray[np.float64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Take the strongest features that no landmark has claimed."""
-        claimed = {(float(x), float(y)) for x, y in occupied.astype(np.float32)}
-        free = [
-            i
-            for i, (x, y) in enumerate(view.corners.keypoints)
-            if (float(x), float(y)) not in claimed
-        ][:count]
-        index = np.array(free, np.int64)
+        free = np.ones(len(view.corners.keypoints), np.bool_)
+        free[self._rows(view, occupied)] = False
+        index = np.flatnonzero(free)[:count]
         return view.corners.keypoints[index].astype(np.float64), view.descriptors[index]
 
     def descriptors_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Look up the features that landmarks were matched to."""
-        place = {(float(x), float(y)): i for i, (x, y) in enumerate(view.corners.keypoints)}
-        index = [place[(float(x), float(y))] for x, y in keypoints.astype(np.float32)]
-        return view.descriptors[np.array(index, np.int64)]
+        return view.descriptors[self._rows(view, keypoints)]
+
+    def levels_at(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Look up the features that landmarks were matched to."""
+        return view.corners.level[self._rows(view, keypoints)]
+
+    def _rows(self, view: View, keypoints: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which features (n,) keypoints are, which come from this view unchanged."""
+        known = view.corners.keypoints @ _AS_ONE
+        order = np.argsort(known, kind="stable")
+        wanted = keypoints.astype(np.float32) @ _AS_ONE
+        return np.asarray(order[np.searchsorted(known[order], wanted)])

@@ -158,6 +158,8 @@ class Follower:
         Ts = np.concatenate([self._map.Ts_world_body(ids), T_world_body[None]])
         seen_at = np.full((len(Ts), len(pixels), 2), np.nan)
         for k, keyframe_id in enumerate(ids.tolist()):
+            if not self._map.is_keyframe_alive(keyframe_id):
+                continue  # it was culled
             features = self._map.keyframe(keyframe_id).features
             if features is None:
                 continue  # it has left the window, and what it saw is forgotten

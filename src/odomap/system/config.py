@@ -22,6 +22,11 @@ from odomap.system.association import (
 )
 from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
+from odomap.system.creating import CreateConfig
+from odomap.system.culling import CullConfig
+from odomap.system.fusing import FuseConfig
+from odomap.system.localmap import LocalMapConfig
+from odomap.system.localmapping import MappingConfig
 from odomap.system.mapping import WindowConfig
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.bootstrap import BootstrapConfig
@@ -29,6 +34,7 @@ from odomap.vision.depth import DepthConfig
 from odomap.vision.features import FeatureConfig
 from odomap.vision.flow import FlowConfig
 from odomap.vision.matching import MatchConfig
+from odomap.vision.orb import OrbConfig
 from odomap.vision.stereo import StereoConfig
 
 __all__ = ["PRESETS", "Config", "make_association", "preset", "preset_for"]
@@ -44,6 +50,8 @@ class Config:
     """How points are followed from image to image."""
     matching: MatchConfig = field(default_factory=MatchConfig)
     """How descriptors are matched."""
+    orb: OrbConfig = field(default_factory=OrbConfig)
+    """How features are found on all levels of a pyramid, and described."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """How disparities are measured."""
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -60,6 +68,16 @@ class Config:
     """When two views of one camera are enough to start."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     """How far what is measured may be off."""
+    local: LocalMapConfig = field(default_factory=LocalMapConfig)
+    """What of the map is searched for in a frame."""
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    """Which part of the map is worked on when there is a new keyframe."""
+    fusing: FuseConfig = field(default_factory=FuseConfig)
+    """When two landmarks are one."""
+    creating: CreateConfig = field(default_factory=CreateConfig)
+    """Which matches become landmarks."""
+    culling: CullConfig = field(default_factory=CullConfig)
+    """What goes from the map."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 
@@ -89,14 +107,26 @@ def _stereo() -> Config:
 
 
 def _stereo_orb() -> Config:
-    return Config(
-        features=FeatureConfig(detector="orb", count=700),
-        tracking=TrackingConfig(association="descriptors"),
-    )
+    return Config(tracking=TrackingConfig(association="descriptors"))
+
+
+def _mono_orb() -> Config:
+    return Config(tracking=TrackingConfig(sensors="mono", association="descriptors"))
+
+
+def _rgbd_orb() -> Config:
+    return Config(tracking=TrackingConfig(sensors="rgbd", association="descriptors"))
 
 
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
-    {"stereo": _stereo, "stereo-orb": _stereo_orb, "mono": _mono, "rgbd": _rgbd}
+    {
+        "stereo": _stereo,
+        "stereo-orb": _stereo_orb,
+        "mono": _mono,
+        "rgbd": _rgbd,
+        "mono-orb": _mono_orb,
+        "rgbd-orb": _rgbd_orb,
+    }
 )
 """Named configurations: stereo, mono and rgbd (optical flow), and stereo-orb (descriptors)."""
 
@@ -131,13 +161,16 @@ def preset_for(rig: Rig) -> str:
     return "stereo" if len(rig.cameras) > 1 else "mono"
 
 
-def make_association(config: Config, mask: NDArray[np.bool_]) -> Association:
+def make_association(
+    config: Config, mask: NDArray[np.bool_], describes: bool = False
+) -> Association:
     """Return the association that a configuration asks for.
 
     Args:
         config: the configuration.
         mask: (H, W) where the image holds something.
+        describes: whether points followed by optical flow are described for the map.
     """
     if config.tracking.association == "flow":
-        return FlowAssociation(config.features, config.flow, mask)
-    return DescriptorAssociation(config.features, config.matching, mask)
+        return FlowAssociation(config.features, config.flow, mask, describes)
+    return DescriptorAssociation(config.orb, config.matching, mask)

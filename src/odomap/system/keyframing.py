@@ -20,6 +20,7 @@ from odomap.sensors.frame import Frame
 from odomap.system.association import Association, Candidates, Reference, View
 from odomap.system.candidates import Followed, Follower
 from odomap.system.config import Config
+from odomap.system.depthbias import DepthBias, bias_at
 from odomap.system.eye import Eye
 from odomap.system.firstsight import FirstSights
 from odomap.system.ranging import Ranger
@@ -61,14 +62,21 @@ class Keyframes:
         map: where they go.
         eye: the camera.
         ranger: measures depth; None for a single camera.
+        bias: what all measured depths are off by, as far as known.
         association: how points are found.
         config: all sections.
     """
 
     def __init__(
-        self, map: Map, eye: Eye, ranger: Ranger | None, association: Association, config: Config
+        self,
+        map: Map,
+        eye: Eye,
+        ranger: Ranger | None,
+        bias: DepthBias,
+        association: Association,
+        config: Config,
     ) -> None:
-        self._map, self._eye, self.ranger = map, eye, ranger
+        self._map, self._eye, self.ranger, self._bias = map, eye, ranger, bias
         self._association, self._config = association, config
         keep = config.window.size + config.window.fixed
         self._sights = (
@@ -110,7 +118,7 @@ class Keyframes:
             descriptors,
             self._eye.camera.unproject(pixels),
             np.full(len(pixels), np.nan),
-            np.zeros(len(pixels), np.uint8),
+            self._association.levels_at(view, pixels),
         )
         return Seen(features, none, at, ranged, none, at, followed)
 
@@ -141,6 +149,24 @@ class Keyframes:
         features = self._features(frame, view, pixels, followed, expected)
         return Seen(features, ids, pixels, tracked.is_ranged[rows], first, first_at, followed)
 
+    def measure_found(
+        self, frame: Frame, view: View, T_world_body: Array, landmark_ids: Index, pixels: Array
+    ) -> Seen:
+        """Find the depths of a view whose landmarks were found one by one, not followed.
+
+        Args:
+            frame: as it came.
+            view: its image.
+            T_world_body: (4, 4).
+            landmark_ids: (n,) landmarks found in it.
+            pixels: (n, 2) at which of its features.
+        """
+        nothing, here = self._nothing(), np.full(len(pixels), -1)
+        expected = 1.0 / np.maximum(self._depth(T_world_body, landmark_ids), 1e-3)
+        features = self._features(frame, view, pixels, nothing, expected)
+        is_ranged = np.isfinite(features.depth[: len(pixels)])
+        return Seen(features, landmark_ids, pixels, is_ranged, here, pixels, nothing)
+
     def add(
         self, view: View, T_world_body: Array, seen: Seen, parent: int, covariance: Array
     ) -> Reference:
@@ -168,14 +194,17 @@ class Keyframes:
             self._sights.remember(keyframe_id, view)
         # A measured depth comes before a triangulated one.
         bearings, T = features.bearings[n:], self._eye.T_body_camera
-        local = bearings / bearings[:, 2:] * features.depth[n:, None]
+        inverse_depth = 1.0 / features.depth[n:] - bias_at(self._bias.value, bearings)
+        inverse_depth[inverse_depth <= 0] = np.nan
+        local = bearings / (bearings[:, 2:] * inverse_depth[:, None])
         points_body = local @ T[:3, :3].T + T[:3, 3]
-        ranged = np.isfinite(features.depth[n:])
+        ranged = np.isfinite(inverse_depth)
         T_body_world = se3_inverse(T_world_body)
         triangulated = followed.points_world @ T_body_world[:3, :3].T + T_body_world[:3, 3]
         points_body[:c] = np.where(ranged[:c, None], points_body[:c], triangulated)
         placed = np.flatnonzero(np.isfinite(points_body[:, 0]))
-        new = self._map.add_landmarks(keyframe_id, points_body[placed])
+        described = features.descriptors[n + placed] if features.descriptors.shape[1] else None
+        new = self._map.add_landmarks(keyframe_id, points_body[placed], described)
         ids = np.concatenate([seen.landmark_ids, new])
         rows = np.concatenate([np.arange(n), n + placed])
         self._map.add_observations(keyframe_id, ids, rows)
@@ -218,22 +247,19 @@ class Keyframes:
     ) -> Features:
         """Gather what is tracked, what is followed, and new corners, as features."""
         kept = np.concatenate([pixels, followed.pixels])
-        wanted = self._config.features.count - len(kept)
+        wanted = self._association.count - len(kept)
         fresh, described = self._association.extend(view, kept, max(wanted, 0))
         keypoints = np.concatenate([kept, fresh])
         depth = np.full(len(keypoints), np.nan)
         if self.ranger is not None:
             depth = 1.0 / self.ranger.measure(frame, view, keypoints, expected)
-        keep = np.isfinite(depth) | (np.arange(len(depth)) < len(kept))
-        if self._config.candidates.follow:
-            keep[:] = True
         descriptors = np.concatenate([self._association.descriptors_at(view, kept), described])
         return Features(
-            keypoints[keep].astype(np.float32),
-            descriptors[keep],
-            self._eye.camera.unproject(keypoints[keep]),
-            depth[keep],
-            np.zeros(int(keep.sum()), np.uint8),
+            keypoints.astype(np.float32),
+            descriptors,
+            self._eye.camera.unproject(keypoints),
+            depth,
+            self._association.levels_at(view, keypoints),
         )
 
     def _first(
@@ -271,6 +297,8 @@ class Keyframes:
     def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:
         """Tell the map which earlier keyframes have seen new landmarks."""
         for keyframe_id in np.unique(history.keyframes[history.keyframes >= 0]).tolist():
+            if not self._map.is_keyframe_alive(keyframe_id):
+                continue  # it was culled
             if self._map.keyframe(keyframe_id).features is None:
                 continue  # it has left the window, and what it saw is forgotten
             which, view = np.nonzero(history.keyframes == keyframe_id)

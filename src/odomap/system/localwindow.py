@@ -9,7 +9,7 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, section VI.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ class LocalWindow:
         sigma_px: standard deviation of a keypoint's position on the finest level.
         level_scale: size of a pyramid level's pixels relative to those of the finer one.
         inverse_depth_sigma: standard deviation of a measured inverse depth, 1/m.
+        inverse_depth_bias: (3,) what all of them are off by, 1/m (see `depthbias`).
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -58,6 +59,7 @@ class LocalWindow:
     sigma_px: float
     level_scale: float
     inverse_depth_sigma: float
+    inverse_depth_bias: Array = field(default_factory=lambda: np.zeros(3))
 
     def features(self, k: int) -> Features:
         """Return the features of keyframe row k."""

@@ -21,7 +21,7 @@ from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.flow import facing_warp
 
-__all__ = ["Located", "Locator"]
+__all__ = ["Located", "Locator", "variance_factor"]
 
 Array = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ class Locator:
             points_world[rows], self._normalised(pixels), np.full(len(rows), np.nan), weights
         )
         solution = self._solve(T_world_body, sightings)
-        factor = self._noise.overlap * _variance_factor(solution)
+        factor = self._noise.overlap * variance_factor(solution)
         return Located(
             solution.T_world_body,
             factor * solution.covariance,
@@ -155,7 +155,7 @@ class Locator:
         return np.stack([f / sigma, np.ones(len(sigma))], axis=1)
 
 
-def _variance_factor(solution: MotionSolution) -> float:
+def variance_factor(solution: MotionSolution) -> float:
     """Return χ² per degree of freedom of the inliers: 1 where the weights say the truth."""
     freedom = 2 * int(solution.inliers.sum()) - 6
     return float(solution.chi2[solution.inliers].sum() / freedom) if freedom > 0 else 1.0

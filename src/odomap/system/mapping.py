@@ -23,6 +23,7 @@ from odomap.limits import Count, Positive, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
+from odomap.system.depthbias import DepthBias, bias_at
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
@@ -55,6 +56,7 @@ class WindowMapper:
         T_body_camera: (4, 4) mount of the pinhole.
         camera: the pinhole.
         window, bundle, noise: sections of the configuration.
+        bias: what all measured depths are off by, learnt here.
         sigma: standard deviation of a measured inverse depth, 1/m.
         calibration: how far all of them may be off together, 1/m.
     """
@@ -67,6 +69,7 @@ class WindowMapper:
         window: WindowConfig,
         bundle: BundleConfig,
         noise: NoiseConfig,
+        bias: DepthBias,
         sigma: float = 1.0,
         calibration: float = 0.0,
     ) -> None:
@@ -74,6 +77,7 @@ class WindowMapper:
         self._T_camera_body = se3_inverse(T_body_camera)
         self._weights = np.array([camera.fx / noise.position_px, 1.0 / sigma])
         self._calibration = Calibration.of(noise, camera, T_body_camera, calibration)
+        self._bias = bias
         self._recent: list[int] = []
         self._drifts: dict[int, Drift] = {}
 
@@ -109,6 +113,7 @@ class WindowMapper:
         newest = change.newest_id
         with map.lock:
             map.apply(change.update)
+            self._bias.learn(change.solution, 1.0 / self._window.size)
             if change.solution.joint_covariance.any():  # else the tracker's word stands
                 self._drifts[newest] = change.drift
                 covariance = self._calibration.total(change.drift, map.T_world_body(newest))
@@ -137,7 +142,8 @@ class WindowMapper:
             seen = snapshot.obs_keypoint[rows]
             bearings = keyframe.features.bearings[seen]
             xy[rows] = bearings[:, :2] / bearings[:, 2:]
-            inverse_depth[rows] = 1.0 / keyframe.features.depth[seen]
+            bias = bias_at(self._bias.value, bearings)
+            inverse_depth[rows] = 1.0 / keyframe.features.depth[seen] - bias
         zeros = np.zeros(len(xy), np.int64)
         return Bundle(
             snapshot.Ts_world_body,

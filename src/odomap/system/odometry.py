@@ -19,12 +19,12 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config, make_association, preset
+from odomap.system.keyframetracking import KeyframeTracker
 from odomap.system.keyframing import Keyframes
 from odomap.system.mapping import WindowMapper
 from odomap.system.path import Path
 from odomap.system.stages import Stages
 from odomap.system.starting import make_start
-from odomap.system.tracking import Tracker
 from odomap.system.visual import Result, Sight, VisualSystem
 
 __all__ = ["MonocularVO", "Odometry", "Result", "RgbdVO", "StereoVO", "make_odometry"]
@@ -41,9 +41,10 @@ class Odometry(VisualSystem):
     def _stages(self, sight: Sight, config: Config) -> Stages:
         eye, ranger = sight.eye, sight.ranger
         association = make_association(config, eye.mask)
-        keyframes = Keyframes(self.map, eye, ranger, association, config)
+        bias = sight.depth_bias(config.noise)
+        keyframes = Keyframes(self.map, eye, ranger, bias, association, config)
         start = make_start(self.map, eye, keyframes, association, config)
-        self._tracker = Tracker(self.map, eye, association, keyframes, start, config)
+        self._tracker = KeyframeTracker(self.map, eye, association, keyframes, start, config)
         depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
         mapper = WindowMapper(
             self.map,
@@ -52,6 +53,7 @@ class Odometry(VisualSystem):
             config.window,
             config.bundle,
             config.noise,
+            bias,
             *depth,
         )
         return Stages(self.map, self._tracker, mapper)

@@ -97,7 +97,10 @@ class Path:
     def keyframes(self) -> Trajectory:
         """Return the keyframes among the frames, those that hang from themselves, as known now."""
         keyframes = [
-            f for f in self._frames if self._map.keyframe(f.keyframe_id).stamp_ns == f.stamp_ns
+            f
+            for f in self._frames
+            if self._map.is_keyframe_alive(f.keyframe_id)
+            and self._map.keyframe(f.keyframe_id).stamp_ns == f.stamp_ns
         ]
         rows = [(f.stamp_ns, self._pose(f), self.covariance(f)) for f in keyframes]
         return _trajectory(rows)

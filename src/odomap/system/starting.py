@@ -195,7 +195,7 @@ class TwoViewsStart:
 
     def _look(self, view: View) -> Waiting:
         """Take a view as the first."""
-        wanted, needed = self._config.features.count, 2 * self._config.bootstrap.min_points
+        wanted, needed = self._association.count, 2 * self._config.bootstrap.min_points
         corners, descriptors = self._association.extend(view, np.empty((0, 2)), wanted)
         self.forget()
         self._needed_px = self._config.bootstrap.min_parallax_px

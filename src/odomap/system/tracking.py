@@ -1,21 +1,24 @@
 """Tracking: the stage that places every frame and makes the keyframes, whatever the camera.
 
-A frame is placed against the landmarks of the last keyframe (`locating`). When the view has changed
-enough it becomes a keyframe itself (`keyframing`). How the first keyframes come about is all that
-differs between a camera with depth and one without (`starting`).
+A frame is placed against landmarks that are known. When the view has changed enough it becomes a
+keyframe itself (`keyframing`). How the first keyframes come about is all that differs between a
+camera with depth and one without (`starting`). Two trackers have this face: one follows the
+landmarks of the last keyframe by optical flow (`keyframetracking`), the other searches for those of
+the local map by their descriptors (`maptracking`).
 
 When too few landmarks agree with a pose the frame is lost, and says so. It is tried from where it
-is expected, from how the image turned, from where it was, and by descriptors (`relocalization`);
-if that fails for some frames, tracking starts anew where it was last, with a covariance that
-admits it.
+is expected, from how the image turned, from where it was, and without any guess; if that fails for
+some frames, tracking starts anew where it was last, with a covariance that admits it.
 
 Reference: Nistér, Naroditsky, Bergen, "Visual Odometry", CVPR 2004; Mur-Artal, Tardós, "ORB-SLAM2",
 T-RO 2017 (stereo keyframes).
 """
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,22 +28,41 @@ from odomap.geometry.pose import SE3
 from odomap.maps.estimate import Estimate, Status, Tracks
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
-from odomap.system.association import Association, Reference, View
-from odomap.system.config import Config
+from odomap.system.association import Association, TrackingConfig, View
 from odomap.system.eye import Eye
-from odomap.system.keyframing import Keyframes
-from odomap.system.locating import Located, Locator
+from odomap.system.locating import Located
 from odomap.system.path import Path, Placed
-from odomap.system.relocalization import relocalize
-from odomap.system.starting import Start, Waiting
+from odomap.system.starting import Start, Started, Waiting
 from odomap.vision.turning import Thumbnail, turn_between
 
-__all__ = ["Tracker"]
+__all__ = ["Clock", "Known", "Look", "Tracker"]
 
 Array = NDArray[np.float64]
 
 
-class _Clock:
+class Known(Protocol):
+    """Landmarks that a frame is placed against.
+
+    Attributes:
+        keyframe_id: the keyframe that the frame will hang from.
+        landmark_ids: (N,) the landmarks.
+        keypoints: (N, 2) where they are in that keyframe, NaN where it does not see them.
+    """
+
+    @property
+    def keyframe_id(self) -> int: ...  # noqa: D102 (see the class)
+
+    @property
+    def landmark_ids(self) -> NDArray[np.int64]: ...  # noqa: D102
+
+    @property
+    def keypoints(self) -> Array: ...  # noqa: D102
+
+
+K = TypeVar("K", bound=Known)
+
+
+class Clock:
     """Milliseconds per stage; for people, nothing decides by it."""
 
     def __init__(self) -> None:
@@ -48,77 +70,106 @@ class _Clock:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
+        """Give the time since the last lap to a stage."""
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + 1e3 * (now - self._last)
         self._last = now
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class Look:
     """A frame being tracked: its ideal view, and the clock."""
 
     frame: Frame
     view: View
-    clock: _Clock
+    clock: Clock
 
 
-class Tracker:
+class Tracker(ABC, Generic[K]):
     """Places the frames of a camera in a map.
 
     Args:
         map: where keyframes go.
         eye: the camera.
-        association: finds landmarks in images.
-        keyframes: makes keyframes.
-        start: makes the first ones.
-        config: all sections.
+        association: makes images ready.
+        start: makes the first keyframes.
+        config: how frames are placed and when one becomes a keyframe.
+
+    Attributes:
+        path: the frames placed so far.
     """
 
     def __init__(
-        self,
-        map: Map,
-        eye: Eye,
-        association: Association,
-        keyframes: Keyframes,
-        start: Start,
-        config: Config,
+        self, map: Map, eye: Eye, association: Association, start: Start, config: TrackingConfig
     ) -> None:
         self._map, self._eye, self._association = map, eye, association
-        self._keyframes, self._start, self._config = keyframes, start, config
-        self._locator = Locator(association, eye.camera, eye.T_body_camera, config.noise)
-        self._reference: Reference | None = None
+        self._start, self._tracking = start, config
         self._last: View | None = None
         self._newest_ns = -1
-        self._epoch = map.epoch
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = 0
 
+    # ---- what trackers differ in ----
+
+    @abstractmethod
+    def _known(self) -> K | None:
+        """Return what the next frame is placed against, as the map is now; None before a start."""
+
+    @abstractmethod
+    def _begun(self, started: Started) -> None:
+        """Take in the first keyframes."""
+
+    @abstractmethod
+    def _try(self, view: View, known: K, T_world_body: Array, needed: int) -> Located:
+        """Place a view from a predicted pose."""
+
+    @abstractmethod
+    def _without_guess(self, view: View, known: K) -> tuple[K, Located] | None:
+        """Place a view without a predicted pose; None if that is not possible."""
+
+    @abstractmethod
+    def _wants_keyframe(self, known: K, located: Located) -> bool:
+        """Say whether it is time for a keyframe."""
+
+    @abstractmethod
+    def _missing(self, frame: Frame) -> str:
+        """Say what a frame lacks to become a keyframe; empty if it has all."""
+
+    @abstractmethod
+    def _make_keyframe(self, look: Look, known: K, located: Located, placed: Placed) -> int:
+        """Make the frame a keyframe; return its id."""
+
+    # ---- tracking ----
+
     def track(self, frame: Frame) -> Estimate:
         """Place one frame; its keyframe, if it became one, is in the map when this returns."""
-        clock = _Clock()
+        clock = Clock()
         if frame.stamp_ns <= self._newest_ns:
             return self._lose(frame, "its time is not after that of the frame before", clock)
         self._newest_ns = frame.stamp_ns
         image = self._eye.image(frame)
         if image is None:
             return self._lose(frame, f"the {self._eye.name} image is missing", clock)
-        look = _Look(frame, self._association.view(frame.id, frame.stamp_ns, image), clock)
+        look = Look(frame, self._association.view(frame.id, frame.stamp_ns, image), clock)
         clock.lap("prepare")
-        reference = self._current_reference()
-        if reference is None:
+        known = self._known()
+        if known is None:
             return self._begin(look)
-        located, status = self._locate(look.view, reference)
+        known, located, status = self._locate(look.view, known)
         clock.lap("track")
-        if located.num_inliers >= self._config.tracking.min_inliers:
-            return self._accept(look, reference, located, status)
-        if self._lost >= self._config.tracking.patience:
+        if located.num_inliers >= self._tracking.min_inliers:
+            return self._accept(look, known, located, status)
+        if self._lost >= self._tracking.patience and self._may_start_anew():
             return self._begin(look)
-        reason = _why_lost(located, self._config.tracking.min_inliers, look.view)
-        return self._lose(frame, reason, clock)
+        return self._lose(frame, _why_lost(located, self._tracking.min_inliers, look.view), clock)
+
+    def _may_start_anew(self) -> bool:
+        """Say whether one that is lost for long may begin again."""
+        return True
 
     # ---- the three ways a frame can go ----
 
-    def _begin(self, look: _Look) -> Estimate:
+    def _begin(self, look: Look) -> Estimate:
         """Start, or start anew after a loss."""
         frame, anew = look.frame, len(self.path) > 0
         T_world_body, covariance = self.path.last_pose(), self._gap_covariance(frame.stamp_ns)
@@ -126,8 +177,9 @@ class Tracker:
         look.clock.lap("keyframe")
         if isinstance(started, Waiting):
             return self._lose(frame, started.reason, look.clock)
-        self._reference, self._since_keyframe, self._lost = started.reference, 0, 0
-        self._first_count, self._epoch = started.count, self._map.epoch
+        self._since_keyframe, self._lost = 0, 0
+        self._first_count = started.count
+        self._begun(started)
         self._last = look.view
         for placed in started.placed[:-1]:
             self.path.append_late(placed)
@@ -141,9 +193,7 @@ class Tracker:
             None,
         )
 
-    def _accept(
-        self, look: _Look, reference: Reference, located: Located, status: Status
-    ) -> Estimate:
+    def _accept(self, look: Look, known: K, located: Located, status: Status) -> Estimate:
         """Turn a placed view into an estimate, and into a keyframe if it is time for one."""
         if self._lost:
             self._start.forget()
@@ -151,28 +201,33 @@ class Tracker:
         self._since_keyframe += 1
         if self._since_keyframe == 1:
             self._first_count = located.num_inliers
-        T_world_reference = self._map.T_world_body(reference.keyframe_id)
+        T_world_reference = self._map.T_world_body(known.keyframe_id)
         placed = Placed(
             look.frame.stamp_ns,
-            reference.keyframe_id,
+            known.keyframe_id,
             se3_inverse(T_world_reference) @ located.T_world_body,
             located.covariance,
         )
+        before = known.keypoints[located.rows]
+        before = np.where(np.isfinite(before), before, located.pixels)
         tracks = Tracks(
             self._eye.to_raw(located.pixels).astype(np.float32),
-            self._eye.to_raw(reference.keypoints[located.rows]).astype(np.float32),
+            self._eye.to_raw(before).astype(np.float32),
             located.inliers,
         )
-        reason, is_keyframe = "", self._wants_keyframe(reference, located)
-        if is_keyframe and (missing := self._keyframes.missing(look.frame)):
+        reason, is_keyframe = "", self._wants_keyframe(known, located)
+        if is_keyframe and (missing := self._missing(look.frame)):
             reason, is_keyframe = f"{missing}: no keyframe", False
         if is_keyframe:
-            placed = self._add_keyframe(look, reference, located, placed)
+            keyframe_id = self._make_keyframe(look, known, located, placed)
+            placed = Placed(placed.stamp_ns, keyframe_id, np.eye(4), np.zeros((6, 6)))
+            self._since_keyframe = 0
+            look.clock.lap("keyframe")
         return self._estimate(
             look, status, reason, placed, located.num_inliers, is_keyframe, tracks
         )
 
-    def _lose(self, frame: Frame, reason: str, clock: _Clock) -> Estimate:
+    def _lose(self, frame: Frame, reason: str, clock: Clock) -> Estimate:
         """Say that this frame has no pose of its own; it repeats the last one known."""
         self._lost += 1
         known = len(self.path) > 0
@@ -191,7 +246,7 @@ class Tracker:
 
     def _estimate(
         self,
-        look: _Look,
+        look: Look,
         status: Status,
         reason: str,
         placed: Placed,
@@ -217,49 +272,27 @@ class Tracker:
 
     # ---- parts ----
 
-    def _current_reference(self) -> Reference | None:
-        """Return the last keyframe, with what the mapper has changed since it was made."""
-        if self._reference is not None and self._epoch != self._map.epoch:
-            self._epoch = self._map.epoch
-            self._reference = self._keyframes.refreshed(self._reference)
-        return self._reference
-
-    def _locate(self, view: View, reference: Reference) -> tuple[Located, Status]:
-        """Try the motions that are likely, then descriptors."""
-        config = self._config.tracking
-        points = self._map.points_world(reference.landmark_ids)
-        T_reference = self._map.T_world_body(reference.keyframe_id)
+    def _locate(self, view: View, known: K) -> tuple[K, Located, Status]:
+        """Try the motions that are likely, then without a guess."""
         T_last = self.path.last_pose()
         tracked = Status.RECOVERED if self._lost else Status.TRACKING
-        enough = max(config.min_inliers, 0.3 * self._first_count)
-        dt = min((view.stamp_ns - self.path.last.stamp_ns) * 1e-9, config.max_prediction_s)
+        enough = int(max(self._tracking.min_inliers, 0.3 * self._first_count))
         best: Located | None = None
-        for motion in self._motions(view, dt):
-            located = self._locator.locate(view, reference, points, T_reference, T_last @ motion)
+        for motion in self._motions(view):
+            located = self._try(view, known, T_last @ motion, enough)
             if located.num_inliers >= enough:
-                return located, tracked
+                return known, located, tracked
             best = located if best is None or located.num_inliers > best.num_inliers else best
         assert best is not None
-        T_world_camera = relocalize(
-            view,
-            reference,
-            points,
-            self._eye.camera,
-            self._config.features,
-            self._config.matching,
-            self._eye.mask,
-            config.min_inliers,
-        )
-        if T_world_camera is not None:
-            T_guess = T_world_camera @ se3_inverse(self._eye.T_body_camera)
-            located = self._locator.locate(view, reference, points, T_reference, T_guess)
-            if located.num_inliers > best.num_inliers:
-                return located, Status.RECOVERED
-        return best, tracked
+        again = self._without_guess(view, known)
+        if again is not None and again[1].num_inliers > best.num_inliers:
+            return *again, Status.RECOVERED
+        return known, best, tracked
 
-    def _motions(self, view: View, dt: float) -> Iterator[Array]:
+    def _motions(self, view: View) -> Iterator[Array]:
         """Yield how the body may have moved: steadily, as the images turned, not at all."""
-        steady = se3_exp(self.path.velocity() * dt)
+        seconds = (view.stamp_ns - self.path.last.stamp_ns) * 1e-9
+        steady = se3_exp(self.path.velocity() * min(seconds, self._tracking.max_prediction_s))
         yield steady
         R = self._turn(view)
         if R is not None:
@@ -277,29 +310,12 @@ class Tracker:
         now = Thumbnail.of(view.pyramid[-1], self._eye.camera)
         return turn_between(Thumbnail.of(self._last.pyramid[-1], self._eye.camera), now)
 
-    def _wants_keyframe(self, reference: Reference, located: Located) -> bool:
-        config = self._config.tracking
-        moved = located.pixels - reference.keypoints[located.rows]
-        motion = np.median(np.linalg.norm(moved[located.inliers], axis=1))
-        return bool(
-            self._since_keyframe >= config.keyframe_interval
-            or located.num_inliers < config.keyframe_ratio * self._first_count
-            or motion > config.keyframe_motion * self._eye.camera.width
-        )
-
-    def _add_keyframe(
-        self, look: _Look, reference: Reference, located: Located, placed: Placed
-    ) -> Placed:
-        """Make the frame a keyframe; the mapper will know its pose better."""
-        T_world_body, inliers = located.T_world_body, located.inliers
-        rows, pixels = located.rows[inliers], located.pixels[inliers]
-        seen = self._keyframes.measure(look.frame, look.view, T_world_body, reference, rows, pixels)
-        self._reference = self._keyframes.add(
-            look.view, T_world_body, seen, reference.keyframe_id, self.path.covariance(placed)
-        )
-        self._since_keyframe = 0
-        look.clock.lap("keyframe")
-        return Placed(placed.stamp_ns, self._reference.keyframe_id, np.eye(4), np.zeros((6, 6)))
+    def _motion_px(self, known: K, located: Located) -> float:
+        """Return by how much landmarks have moved in the image since the keyframe, the median."""
+        moved = located.pixels - known.keypoints[located.rows]
+        by = np.linalg.norm(moved[located.inliers], axis=1)
+        by = by[np.isfinite(by)]
+        return float(np.median(by)) if len(by) else np.inf
 
     def _gap_covariance(self, stamp_ns: int) -> Array:
         """Say how unsure the last pose is by now: a metre and half a radian per second unseen."""

@@ -24,11 +24,13 @@ from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config
+from odomap.system.depthbias import DepthBias
 from odomap.system.eye import Eye
 from odomap.system.path import Path
 from odomap.system.ranging import DepthRanger, Ranger, StereoRanger
 from odomap.system.rhythms import make_worker
 from odomap.system.stages import Stages
+from odomap.system.uncertainty import Calibration, NoiseConfig
 from odomap.vision.rectifier import Rectifier
 
 __all__ = ["Result", "Sight", "VisualSystem"]
@@ -75,6 +77,13 @@ class Sight:
     eye: Eye
     ranger: Ranger | None
     T_body_tracked: NDArray[np.float64]
+
+    def depth_bias(self, noise: NoiseConfig) -> DepthBias:
+        """Return what measured depths may be off by together, to be learnt."""
+        calibration = 0.0 if self.ranger is None else self.ranger.calibration
+        eye = self.eye
+        known = Calibration.of(noise, eye.camera, eye.T_body_camera, calibration)
+        return DepthBias(known.inverse_depth)
 
     @staticmethod
     def of(rig: Rig, config: Config) -> "Sight":

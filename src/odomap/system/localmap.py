@@ -1,0 +1,174 @@
+"""The local map: the landmarks that a camera may see from where it is.
+
+They are those of the keyframes that share landmarks with the last frame, and of those that look at
+the same place from nearby, though nothing is shared yet: so what was seen long ago is looked for
+again when the camera comes back. How many there are depends on the place, not on the map.
+
+Which of them a frame should show follows from a predicted pose: a landmark is expected if it lies
+in the image, is not seen from another side than before, and at a distance at which it would be
+found again; the level of the pyramid is predicted from that distance.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015, section V-D.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.camera import Camera
+from odomap.limits import Count, NotNegative, Positive, check_limits
+from odomap.maps.map import Map
+from odomap.maps.views import LandmarkViews
+
+__all__ = ["Expected", "LocalMap", "LocalMapConfig", "expect", "local_map"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SIDE = 0.5
+"""Cosine of the angle between the directions of view beyond which a landmark looks different."""
+MARGIN_PX = 2.0
+"""Nearer to the rim of the image nothing is found."""
+
+
+@dataclass(frozen=True)
+class LocalMapConfig:
+    """What is searched for in a frame, and how."""
+
+    keyframes: Count = 20
+    """Keyframes whose landmarks are looked for, of those that share any with the last frame."""
+    near: Count = 5
+    """Further keyframes that look at the same place from nearby."""
+    near_distance: NotNegative = 0.3
+    """How near those are, as a fraction of the median distance of landmarks."""
+    near_angle_deg: NotNegative = 30.0
+    """How much their directions of view may differ."""
+    first_radius_px: Positive = 12.0
+    """Search radius around what motion predicts, on the finest level."""
+    radius_px: Positive = 4.0
+    """Search radius once the pose is known well, on the finest level."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMap:
+    """Landmarks around a keyframe, ready to be searched for.
+
+    Attributes:
+        keyframe_id: the keyframe that frames hang from here.
+        views: the N landmarks, and how they were seen.
+        keypoints: (N, 2) where in that keyframe; NaN where it does not see them.
+        relative: (N,) standard deviation of a landmark's distance as a fraction of it.
+    """
+
+    keyframe_id: int
+    views: LandmarkViews
+    keypoints: Array
+    relative: Array
+
+    @property
+    def landmark_ids(self) -> Index:
+        """(N,) ids, ascending."""
+        return self.views.ids
+
+    def __len__(self) -> int:
+        return len(self.views.ids)
+
+    def rows_of(self, landmark_ids: Index) -> Index:
+        """Return the rows of those of some landmarks (n,) that are here, ascending."""
+        return np.flatnonzero(np.isin(self.views.ids, landmark_ids))
+
+
+def local_map(
+    map: Map,
+    keyframe_id: int,
+    T_world_body: Array,
+    T_body_camera: Array,
+    sigma: float | None,
+    config: LocalMapConfig,
+) -> LocalMap:
+    """Gather the landmarks around a keyframe.
+
+    Args:
+        map: what is remembered.
+        keyframe_id: the keyframe.
+        T_world_body: (4, 4) where the body is.
+        T_body_camera: (4, 4) mount of the pinhole.
+        sigma: standard deviation of a measured inverse depth, 1/m; None for a single camera.
+        config: how much is gathered.
+    """
+    seen, rows = map.observations_of(keyframe_id)
+    sharing = map.observing(seen)[0][: config.keyframes]
+    points = map.points_world(seen)
+    away = np.linalg.norm(points - T_world_body[:3, 3], axis=1)
+    radius = config.near_distance * float(np.median(away)) if len(away) else 0.0
+    near = map.near(T_world_body, radius, np.radians(config.near_angle_deg))
+    near = near[~np.isin(near, sharing)][: config.near]
+    ids = map.landmarks_of(np.concatenate([sharing, near, [keyframe_id]]))
+    views = map.views_of(ids, T_body_camera)
+    keypoints = np.full((len(views), 2), np.nan)
+    features = map.keyframe(keyframe_id).features
+    if features is not None and len(seen):
+        at = np.searchsorted(views.ids, seen)
+        keypoints[at] = features.keypoints[rows]
+    relative = np.zeros(len(views))
+    if sigma is not None:
+        observers = np.maximum(map.count_observers(views.ids), 1)
+        relative = sigma * views.distance / np.sqrt(observers)
+    return LocalMap(keyframe_id, views, keypoints, relative)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Landmarks of a local map that a frame should show.
+
+    Attributes:
+        rows: (n,) of the local map.
+        points_camera: (n, 3).
+        pixels: (n, 2) where.
+        level: (n,) on which level of the pyramid.
+    """
+
+    rows: Index
+    points_camera: Array
+    pixels: Array
+    level: Index
+
+
+def expect(
+    local: LocalMap,
+    rows: Index,
+    T_camera_world: Array,
+    camera: Camera,
+    level_scale: float,
+    levels: int,
+) -> Expected:
+    """Tell which landmarks a frame should show.
+
+    Args:
+        local: the local map.
+        rows: (m,) which of it are asked about.
+        T_camera_world: (4, 4) the predicted pose.
+        camera: the pinhole.
+        level_scale, levels: of the pyramid.
+    """
+    views = local.views
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    points = views.points_world[rows] @ R.T + t
+    depth = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    distance = np.linalg.norm(points, axis=1)
+    facing = np.sum((views.normals[rows] @ R.T) * points, axis=1) > SIDE * distance
+    with np.errstate(divide="ignore"):
+        closer = np.log(views.distance[rows] / distance) / np.log(level_scale)
+    level = views.level[rows] + closer
+    sized = (level > -1.5) & (level < levels + 0.5)
+    inside = camera.is_inside(np.nan_to_num(pixels, nan=-1.0), MARGIN_PX)
+    shown = np.flatnonzero((depth > 0.05) & inside & facing & sized)
+    predicted = np.rint(level[shown]).astype(np.int64).clip(0, levels - 1)
+    return Expected(rows[shown], points[shown], pixels[shown], predicted)

@@ -1,0 +1,155 @@
+"""Locating in a map: where the body is at a new frame, by guided search for landmarks.
+
+First the landmarks that the frame before has shown are looked for around where the predicted
+motion puts them; they give a pose. With that all others of the local map are projected, and looked
+for nearby; all together give the pose again. Descriptors say which feature is which landmark, the
+level of the pyramid how sure its position is: σ s^l.
+
+Cost: grows with the local map, not with the map.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015, sections V-B and V-D.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.backend.motion import MotionSolution, Sightings, solve_motion
+from odomap.geometry.camera import Camera
+from odomap.geometry.lie import se3_inverse
+from odomap.system.association import View
+from odomap.system.localmap import LocalMap, LocalMapConfig, expect
+from odomap.system.locating import Located, variance_factor
+from odomap.system.ranging import UNIT_BASELINE
+from odomap.system.uncertainty import NoiseConfig
+from odomap.vision.matching import KeypointGrid, MatchConfig, match_projected
+from odomap.vision.orb import OrbConfig
+
+__all__ = ["MapLocator"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class MapLocator:
+    """Finds the pose of views in a local map.
+
+    Args:
+        camera: the pinhole.
+        T_body_camera: (4, 4) its mount.
+        orb, matching, search, noise: sections of the configuration.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        T_body_camera: Array,
+        orb: OrbConfig,
+        matching: MatchConfig,
+        search: LocalMapConfig,
+        noise: NoiseConfig,
+    ) -> None:
+        self._camera, self._T_camera_body = camera, se3_inverse(T_body_camera)
+        self._orb, self._matching, self._search, self._noise = orb, matching, search, noise
+
+    def locate(
+        self, view: View, local: LocalMap, likely: Index, T_world_body: Array, needed: int
+    ) -> Located:
+        """Place a view.
+
+        Args:
+            view: its features.
+            local: the landmarks around.
+            likely: (n,) rows of those that should be there, since the last frame has shown them.
+            T_world_body: (4, 4) predicted pose.
+            needed: inliers without which a look around is of no use.
+
+        Returns:
+            The pose, to be believed if enough inliers agree.
+        """
+        grid = KeypointGrid.of(view.corners.keypoints, view.image.shape)
+        rows, found, expected = self._search_for(
+            view, grid, local, likely, T_world_body, self._search.first_radius_px
+        )
+        solution = self._solve(view, local, rows, found, T_world_body)
+        if int(solution.inliers.sum()) < needed or not solution.converged:
+            return self._located(view, rows, found, solution, expected)
+        rows, found = rows[solution.inliers], found[solution.inliers]
+        others = np.setdiff1d(np.arange(len(local)), rows)
+        more, at, around = self._search_for(
+            view, grid, local, others, solution.T_world_body, self._search.radius_px, found
+        )
+        rows, found = np.concatenate([rows, more]), np.concatenate([found, at])
+        solution = self._solve(view, local, rows, found, solution.T_world_body)
+        return self._located(view, rows, found, solution, len(rows) - len(more) + around)
+
+    def _search_for(
+        self,
+        view: View,
+        grid: KeypointGrid,
+        local: LocalMap,
+        rows: Index,
+        T_world_body: Array,
+        radius_px: float,
+        claimed: Index | None = None,
+    ) -> tuple[Index, Index, int]:
+        """Match landmarks to features; return rows, features, and how many were expected."""
+        T_camera_world = self._T_camera_body @ se3_inverse(T_world_body)
+        scale, levels = self._orb.scale, self._orb.levels
+        there = expect(local, rows, T_camera_world, self._camera, scale, levels)
+        index = match_projected(
+            local.views.descriptors[there.rows],
+            there.pixels,
+            radius_px * scale ** there.level.astype(np.float64),
+            there.level - 1,
+            there.level + 1,
+            view.descriptors,
+            view.corners.keypoints,
+            view.corners.level,
+            grid,
+            self._matching,
+        )
+        matched = index >= 0
+        if claimed is not None:
+            matched &= ~np.isin(index, claimed)
+        return there.rows[matched], index[matched], len(there.rows)
+
+    def _solve(
+        self, view: View, local: LocalMap, rows: Index, found: Index, T_world_body: Array
+    ) -> MotionSolution:
+        """Find the pose that agrees with matches of landmarks and features."""
+        camera, points = self._camera, local.views.points_world[rows]
+        pixels = view.corners.keypoints[found].astype(np.float64)
+        sigma = self._noise.position_px * self._orb.scale ** view.corners.level[found].astype(float)
+        sigma = np.hypot(sigma, self._slide(local, rows, T_world_body))
+        xy = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        weights = np.stack([camera.fx / sigma, np.ones(len(sigma))], axis=1)
+        none = np.full(len(rows), np.nan)
+        sightings = Sightings(points, xy, none, weights)
+        return solve_motion(T_world_body, self._T_camera_body, UNIT_BASELINE, sightings)
+
+    def _slide(self, local: LocalMap, rows: Index, T_world_body: Array) -> Array:
+        """Return by how many pixels (n,) landmarks may be off since their depth is not exact.
+
+        An error of depth moves a landmark along the ray on which it was seen; here that moves its
+        projection, unless the camera looks along the same ray.
+        """
+        T = self._T_camera_body @ se3_inverse(T_world_body)
+        points = local.views.points_world[rows] @ T[:3, :3].T + T[:3, 3]
+        ray = local.views.normals[rows] @ T[:3, :3].T
+        depth = np.maximum(points[:, 2:], 1e-6)
+        across = np.linalg.norm(ray[:, :2] - points[:, :2] / depth * ray[:, 2:], axis=1)
+        error = np.minimum(local.relative[rows], 1.0) * local.views.distance[rows]
+        return np.asarray(self._camera.fx * across * error / depth[:, 0])
+
+    def _located(
+        self, view: View, rows: Index, found: Index, solution: MotionSolution, expected: int
+    ) -> Located:
+        return Located(
+            solution.T_world_body,
+            self._noise.overlap * variance_factor(solution) * solution.covariance,
+            rows,
+            view.corners.keypoints[found].astype(np.float64),
+            solution.inliers & solution.converged,
+            expected,
+        )

@@ -1,0 +1,190 @@
+"""Tracking against the map: every frame is placed by all landmarks around that it shows.
+
+The features of a frame are matched to the local map (`localmap`, `maplocating`). Frames hang from
+the keyframe that shares most landmarks with them, which need not be the last one: a camera that
+comes back to a place is tracked against what was mapped there. A frame becomes a keyframe when it
+shows clearly less of the map than its keyframe, that is, something new.
+
+When a frame cannot be placed from where it is expected, it is looked up in the whole map by what it
+shows (`recognition`). Where the map is not to be changed, no keyframe is made.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015, section V.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.lie import se3_inverse
+from odomap.maps.estimate import Estimate, Status
+from odomap.maps.map import Map
+from odomap.sensors.frame import Frame
+from odomap.system.association import Association, View
+from odomap.system.config import Config
+from odomap.system.eye import Eye
+from odomap.system.keyframing import Keyframes
+from odomap.system.localmap import LocalMap, local_map
+from odomap.system.locating import Located
+from odomap.system.maplocating import MapLocator
+from odomap.system.path import Placed
+from odomap.system.recognition import Recognizer
+from odomap.system.starting import Start, Started
+from odomap.system.tracking import Look, Tracker
+
+__all__ = ["MapTracker"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+STILL = 0.005
+"""A camera whose landmarks moved by less than this part of the image has seen nothing new."""
+
+
+class MapTracker(Tracker[LocalMap]):
+    """Places frames against the local map.
+
+    Args:
+        map: where keyframes go.
+        eye: the camera.
+        association: finds and describes features.
+        keyframes: makes keyframes.
+        start: makes the first ones.
+        config: all sections.
+        is_mapping: whether keyframes are made.
+    """
+
+    def __init__(
+        self,
+        map: Map,
+        eye: Eye,
+        association: Association,
+        keyframes: Keyframes,
+        start: Start,
+        config: Config,
+        is_mapping: bool = True,
+    ) -> None:
+        super().__init__(map, eye, association, start, config.tracking)
+        self._keyframes, self._config, self._is_mapping = keyframes, config, is_mapping
+        self._locator = MapLocator(
+            eye.camera, eye.T_body_camera, config.orb, config.matching, config.local, config.noise
+        )
+        self._recognizer = Recognizer(
+            map,
+            eye.camera,
+            eye.T_body_camera,
+            config.matching,
+            config.tracking.min_inliers,
+            config.orb.scale,
+        )
+        self._local: LocalMap | None = None
+        self._epoch = map.epoch
+        self._shown = np.empty(0, np.int64)
+        self._expected_often: list[Index] = []
+        self._seen_often: list[Index] = []
+
+    # ---- the local map ----
+
+    def _begun(self, started: Started) -> None:
+        self._turn_to(
+            started.reference.keyframe_id, self._map.T_world_body(started.reference.keyframe_id)
+        )
+        self._shown = started.reference.landmark_ids
+
+    def _known(self) -> LocalMap | None:
+        """Return the local map, read again where the mapper has changed the map."""
+        if self._local is not None and self._epoch != self._map.epoch:
+            self._turn_to(self._local.keyframe_id, self.path.last_pose())
+            self._shown = self._map.resolve(self._shown)
+        return self._local
+
+    def _turn_to(self, keyframe_id: int, T_world_body: Array) -> None:
+        """Take the surroundings of a keyframe as the local map."""
+        self._count()
+        alive = keyframe_id
+        if not self._map.is_keyframe_alive(keyframe_id):
+            alive = self._map.parent(keyframe_id)
+        ranger = self._keyframes.ranger
+        self._epoch = self._map.epoch
+        self._local = local_map(
+            self._map,
+            alive,
+            T_world_body,
+            self._eye.T_body_camera,
+            None if ranger is None else ranger.sigma,
+            self._config.local,
+        )
+
+    def _count(self) -> None:
+        """Tell the map how often landmarks were expected, and found."""
+        for counted, tell in (
+            (self._expected_often, self._map.count_expected),
+            (self._seen_often, self._map.count_seen),
+        ):
+            if counted:
+                tell(np.concatenate(counted))
+            counted.clear()
+
+    # ---- placing ----
+
+    def _try(self, view: View, known: LocalMap, T_world_body: Array, needed: int) -> Located:
+        return self._locator.locate(view, known, known.rows_of(self._shown), T_world_body, needed)
+
+    def _without_guess(self, view: View, known: LocalMap) -> tuple[LocalMap, Located] | None:
+        """Look the view up in the whole map."""
+        found = self._recognizer.find(
+            view.descriptors,
+            view.corners.keypoints,
+            view.corners.level,
+            view.frame_id,
+            guess=self.path.last_pose() @ self._eye.T_body_camera,
+        )
+        if isinstance(found, str):
+            return None
+        T_world_body = found.T_world_camera @ se3_inverse(self._eye.T_body_camera)
+        self._turn_to(found.keyframe_id, T_world_body)
+        assert self._local is not None
+        likely = self._local.rows_of(found.landmark_ids)
+        located = self._locator.locate(view, self._local, likely, T_world_body, 0)
+        return self._local, located
+
+    def _accept(self, look: Look, known: LocalMap, located: Located, status: Status) -> Estimate:
+        """Accept a frame, and turn to the keyframe that shares most landmarks with it."""
+        shown = known.landmark_ids[located.rows[located.inliers]]
+        estimate = super()._accept(look, known, located, status)
+        if not estimate.is_keyframe:
+            self._shown = shown
+            self._seen_often.append(shown)
+            nearest = int(self._map.observing(shown)[0][0])
+            if nearest != known.keyframe_id:
+                self._turn_to(nearest, located.T_world_body)
+        return estimate
+
+    # ---- keyframes ----
+
+    def _wants_keyframe(self, known: LocalMap, located: Located) -> bool:
+        config = self._config.tracking
+        if not self._is_mapping:
+            return False
+        motion = self._motion_px(known, located) / self._eye.camera.width
+        return bool(
+            (self._since_keyframe >= config.keyframe_interval and motion > STILL)
+            or located.num_inliers < config.keyframe_ratio * self._first_count
+        )
+
+    def _missing(self, frame: Frame) -> str:
+        return self._keyframes.missing(frame)
+
+    def _make_keyframe(self, look: Look, known: LocalMap, located: Located, placed: Placed) -> int:
+        """Make the frame a keyframe with all that it shows of the map."""
+        T_world_body, inliers = located.T_world_body, located.inliers
+        rows, pixels = located.rows[inliers], located.pixels[inliers]
+        ids = known.landmark_ids[rows]
+        seen = self._keyframes.measure_found(look.frame, look.view, T_world_body, ids, pixels)
+        covariance = self.path.covariance(placed)
+        made = self._keyframes.add(look.view, T_world_body, seen, known.keyframe_id, covariance)
+        self._turn_to(made.keyframe_id, T_world_body)
+        self._shown = made.landmark_ids
+        return made.keyframe_id
+
+    def _may_start_anew(self) -> bool:
+        return self._is_mapping

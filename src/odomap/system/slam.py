@@ -1,0 +1,99 @@
+"""SLAM with cameras: tracking against a map that goes on being mapped, and the map as a result.
+
+    system = Slam(source.rig)
+    for frame in source:
+        estimate = system.track(frame)
+    result = system.finish()
+    odomap.save_map("home.odomap", result.map, source.rig)
+
+The tracker places every frame; each new keyframe is given to local mapping, which completes,
+adjusts and thins the map around it, in a thread of its own unless the rhythm is "inline". Unlike
+an odometry's, the map is kept: what was seen before is found again, and used.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015; Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017.
+"""
+
+from collections.abc import Mapping
+
+from odomap.maps.map import Map
+from odomap.sensors.rig import Rig
+from odomap.system.config import Config, make_association, preset, preset_for
+from odomap.system.keyframetracking import KeyframeTracker
+from odomap.system.keyframing import Keyframes
+from odomap.system.localmapping import LocalMapper, MappingSections
+from odomap.system.maptracking import MapTracker
+from odomap.system.path import Path
+from odomap.system.stages import Stages
+from odomap.system.starting import make_start
+from odomap.system.visual import Sight, VisualSystem
+
+__all__ = ["Slam"]
+
+
+class Slam(VisualSystem):
+    """Simultaneous localisation and mapping with the cameras of a rig.
+
+    Args:
+        rig: one camera, a stereo pair, or a camera with depth.
+        config: sections for all parts; default the preset for what the rig carries.
+        rhythm: which thread runs what; see `rhythms`.
+        map: a map to go on with; default a new one.
+        is_mapping: whether the map is changed; if not, frames are only placed in it.
+
+    Attributes:
+        map: keyframes and landmarks.
+        worker: runs the stages; its lists of observers are told of estimates and keyframes.
+
+    Raises:
+        CalibrationError: the rig does not carry what the configuration says.
+        ConfigError: there is no such rhythm.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: Config | None = None,
+        rhythm: str = "inline",
+        map: Map | None = None,
+        is_mapping: bool = True,
+    ) -> None:
+        config = preset(preset_for(rig)) if config is None else config
+        self._is_mapping = is_mapping
+        super().__init__(Sight.of(rig, config), config, rhythm, map)
+
+    def _stages(self, sight: Sight, config: Config) -> Stages:
+        eye, ranger = sight.eye, sight.ranger
+        association = make_association(config, eye.mask, describes=True)
+        bias = sight.depth_bias(config.noise)
+        keyframes = Keyframes(self.map, eye, ranger, bias, association, config)
+        start = make_start(self.map, eye, keyframes, association, config)
+        parts = self.map, eye, association, keyframes, start, config
+        follows = config.tracking.association == "flow"
+        self._tracker = KeyframeTracker(*parts) if follows else MapTracker(*parts, self._is_mapping)
+        depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
+        sections = _sections(config)
+        self._mapper = LocalMapper(
+            self.map, eye.camera, eye.T_body_camera, sections, bias, *depth, ranger is not None
+        )
+        return Stages(self.map, self._tracker, self._mapper)
+
+    @property
+    def _path(self) -> Path:
+        return self._tracker.path
+
+    def _counts(self) -> Mapping[str, int]:
+        return dict(self._mapper.counts)
+
+
+def _sections(config: Config) -> MappingSections:
+    return MappingSections(
+        config.mapping,
+        config.creating,
+        config.fusing,
+        config.culling,
+        config.matching,
+        config.bundle,
+        config.noise,
+        config.orb.scale,
+    )
