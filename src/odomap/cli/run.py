@@ -59,7 +59,10 @@ class Run:
         """Track, write, and say where everything is."""
         from odomap.run import chosen_config
         from odomap.sources.open import open as open_source
+        from odomap.views.liveserver import check_viewer
 
+        if self.view:
+            check_viewer()
         chosen_config(self.preset, self.config, self.overrides)  # names are checked first
         source = open_source(self.data, self.rig)
         config = chosen_config(self.preset, self.config, self.overrides, source.rig)

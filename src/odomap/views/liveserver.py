@@ -10,6 +10,7 @@ Reference: viser, github.com/nerfstudio-project/viser (Apache-2.0).
 """
 
 import contextlib
+import errno
 import importlib
 import socket
 from collections.abc import Iterator
@@ -93,6 +94,8 @@ def _free_port(host: str, port: int) -> int:
                 probe.listen()  # two may be bound to a port, one alone listens
                 return candidate
             except OSError as error:
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                    raise InputError(f"address '{host}' of the view: {error.strerror}") from error
                 refused = error
     raise InputError(f"no free port at {host} from {port} on: {refused.strerror}")
 
