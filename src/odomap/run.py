@@ -162,8 +162,8 @@ def run(
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
     chosen_config(preset, config)  # a wrong name is told before anything is opened
-    source = data if isinstance(data, Source) else _opened(data, rig)
     saved = None if map is None else SavedMap.of(map)
+    source = data if isinstance(data, Source) else _opened(data, rig)
     usual = None if saved is None else saved.sensors or None
     settings = chosen_config(preset or usual, config, rig=source.rig)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}

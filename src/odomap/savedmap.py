@@ -142,6 +142,8 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
         here: the rig of a recording.
         sensors: stereo, rgbd or mono.
     """
+    if sensors == "rgbd" and here.depth is None:
+        yield "a depth image there, none here"
     theirs, ours = _used(there, sensors), _used(here, sensors)
     if len(theirs) != len(ours):
         yield f"{len(theirs)} cameras there, {len(ours)} here"

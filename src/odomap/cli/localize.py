@@ -42,8 +42,8 @@ class _WithMap:
         from odomap.sources.open import open as open_source
 
         chosen_config(self.preset, self.config, self.overrides)  # names are checked first
-        source = open_source(self.data, self.rig)
         saved = SavedMap.load(self.map)
+        source = open_source(self.data, self.rig)
         preset = self.preset or saved.sensors or None
         config = chosen_config(preset, self.config, self.overrides, source.rig)
         out = self.out or Path("runs") / f"{folder_name(source.name)}_{default}"
