@@ -54,7 +54,7 @@ def rotated_brief(
 
 
 @functools.cache
-def _tables() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _tables() -> tuple[NDArray[np.float32], NDArray[np.int16]]:
     """Return all first and then all second points, (2, 512), and the arms of the disc.
 
     Arms are (2, 31, 32): the offsets u and v of a pixel from the centre, 0 outside the disc.
@@ -62,7 +62,7 @@ def _tables() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     points = np.stack([PAIRS[:, 0::2].T.ravel(), PAIRS[:, 1::2].T.ravel()]).astype(np.float32)
     v, u = np.mgrid[-15:16, -15:17]
     inside = u * u + v * v < DISC_PX**2
-    arms = np.stack([u * inside, v * inside]).astype(np.int32)
+    arms = np.stack([u * inside, v * inside]).astype(np.int16)
     points.setflags(write=False)
     arms.setflags(write=False)
     return points, arms
@@ -101,15 +101,15 @@ def _smooth_kernel(image: Image, line: NDArray[np.uint16], smooth: Image) -> Non
 
 
 @kernel(reorder=True)
-def _centroid(image: Image, x: int, y: int, arms: NDArray[np.int32]) -> float:
+def _centroid(image: Image, x: int, y: int, arms: NDArray[np.int16]) -> float:
     """θ = atan2(Σ v I(x + u, y + v), Σ u I(x + u, y + v)); arms: u and v, 0 outside the disc."""
     mx, my = np.int32(0), np.int32(0)
     for v in range(31):
         row = image[y + v - 15, x - 15 : x + 17]
         for u in range(32):
             grey = np.int32(row[u])
-            mx += arms[0, v, u] * grey
-            my += arms[1, v, u] * grey
+            mx += np.int32(arms[0, v, u]) * grey
+            my += np.int32(arms[1, v, u]) * grey
     return float(np.arctan2(float(my), float(mx)))
 
 
@@ -148,7 +148,7 @@ def _describe_kernel(
     smooth: Image,
     pixels: NDArray[np.int32],
     points: NDArray[np.float32],
-    arms: NDArray[np.int32],
+    arms: NDArray[np.int16],
     angle: NDArray[np.float32],
     descriptors: NDArray[np.uint8],
 ) -> None:

@@ -134,6 +134,18 @@ def _score_kernel(image: Image, scores: NDArray[np.uint8]) -> None:
 
 
 @kernel
+def _lowest_byte(word: np.uint64) -> int:
+    """Index of the lowest byte that is not 0: the number of zero bits below the lowest one, / 8."""
+    below = (word & (~word + np.uint64(1))) - np.uint64(1)
+    pairs = below - ((below >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    nibbles = (pairs & np.uint64(0x3333333333333333)) + (
+        (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)
+    )
+    total = (nibbles + (nibbles >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int((total * np.uint64(0x0101010101010101)) >> np.uint64(59))
+
+
+@kernel
 def _peaks_kernel(
     scores: NDArray[np.uint8],
     threshold: int,
@@ -153,13 +165,14 @@ def _peaks_kernel(
             after = max(max(below[x], below[x + 1]), max(below[x + 2], here[x + 2]))
             peaks[x + 1] = c if (c > max(before, t)) & (c >= after) else np.uint8(0)
         for word in range(border // 8, (width - border + 7) // 8):
-            if words[word] == 0:
-                continue
-            for x in range(max(8 * word, border), min(8 * word + 8, width - border)):
-                if peaks[x] == 0:
-                    continue
-                corners[found, 0], corners[found, 1], corners[found, 2] = x, y, here[x]
-                found += 1
+            rest = words[word]
+            while rest != 0:
+                byte = _lowest_byte(rest)
+                rest &= ~(np.uint64(255) << np.uint64(8 * byte))
+                x = 8 * word + byte
+                if x >= border and x < width - border:
+                    corners[found, 0], corners[found, 1], corners[found, 2] = x, y, here[x]
+                    found += 1
     return found
 
 
