@@ -32,6 +32,8 @@ __all__ = [
 
 Image = NDArray[np.uint8]
 
+REACH = 0.08
+"""How far descriptors are looked for where nothing predicts a motion, as part of the width."""
 _AS_ONE = np.array([1.0, 1j])
 """Makes one number of a pixel, which can be looked up."""
 
@@ -291,12 +293,13 @@ class DescriptorAssociation:
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Match the descriptors near the guesses."""
+        reach = max(self.matching.radius_px, REACH * view.image.shape[1])
         matches = match_guided(
             descriptors,
             guess,
             view.descriptors,
             view.corners.keypoints,
-            self.matching,
+            replace(self.matching, radius_px=reach),
         )
         found = matches >= 0
         pixels = np.array(guess)

@@ -36,6 +36,9 @@ Index = NDArray[np.int64]
 
 MATCH_PATIENCE = 5
 """Views in a row in which a corner known by its descriptor may be missed."""
+LEAST_FOLLOWED, LEAST_MATCHED = 0.4, 0.1
+"""Part of the corners that must be found again: followed, or known by their descriptors, of which
+many are not repeated."""
 MOST_BETWEEN = 300
 """Frames between the two views that are remembered, and placed afterwards."""
 MORE_PARALLAX = 1.2
@@ -158,6 +161,9 @@ class TwoViewsStart:
         self._corners: FollowedCorners | None = None
         self._between: list[_Between] = []
         self._needed_px = config.bootstrap.min_parallax_px
+        follows = config.tracking.association == "flow"
+        self._share = LEAST_FOLLOWED if follows else LEAST_MATCHED
+        self._patience = 0 if follows else MATCH_PATIENCE
 
     def forget(self) -> None:
         """Drop the first view."""
@@ -171,7 +177,7 @@ class TwoViewsStart:
             return self._look(view)
         corners = self._corners
         corners.follow(view)
-        if len(corners.found) < max(self._config.bootstrap.min_points, 0.4 * len(corners)):
+        if len(corners.found) < max(self._config.bootstrap.min_points, self._share * len(corners)):
             again = self._look(view)
             return Waiting(f"the view changed before the motion was known; {again.reason}")
         found = two_view_motion(
@@ -202,9 +208,8 @@ class TwoViewsStart:
         if len(corners) < needed:
             why = f"{len(corners)} corners of {needed} needed to start"
             return Waiting(f"{why}: too dark or no texture?")
-        patience = 0 if self._config.tracking.association == "flow" else MATCH_PATIENCE
         self._corners = FollowedCorners(
-            view, corners, descriptors, self._eye.camera, self._association, patience
+            view, corners, descriptors, self._eye.camera, self._association, self._patience
         )
         return Waiting("a first view is taken: move the camera sideways")
 
