@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
+from odomap.vision.hamming import lowest_byte
 
 __all__ = ["LEAST_BORDER_PX", "fast_corners", "warm_up"]
 
@@ -134,18 +135,6 @@ def _score_kernel(image: Image, scores: NDArray[np.uint8]) -> None:
 
 
 @kernel
-def _lowest_byte(word: np.uint64) -> int:
-    """Index of the lowest byte that is not 0: the number of zero bits below the lowest one, / 8."""
-    below = (word & (~word + np.uint64(1))) - np.uint64(1)
-    pairs = below - ((below >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    nibbles = (pairs & np.uint64(0x3333333333333333)) + (
-        (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)
-    )
-    total = (nibbles + (nibbles >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return int((total * np.uint64(0x0101010101010101)) >> np.uint64(59))
-
-
-@kernel
 def _peaks_kernel(
     scores: NDArray[np.uint8],
     threshold: int,
@@ -167,7 +156,7 @@ def _peaks_kernel(
         for word in range(border // 8, (width - border + 7) // 8):
             rest = words[word]
             while rest != 0:
-                byte = _lowest_byte(rest)
+                byte = lowest_byte(rest)
                 rest &= ~(np.uint64(255) << np.uint64(8 * byte))
                 x = 8 * word + byte
                 if x >= border and x < width - border:

@@ -22,6 +22,8 @@ __all__ = [
     "NO_DISTANCE",
     "as_words",
     "hamming",
+    "lowest_byte",
+    "popcount",
     "search_all",
     "search_circles",
     "search_lines",
@@ -44,17 +46,29 @@ def as_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
 
 
 @kernel
-def hamming(a: NDArray[np.uint64], i: int, b: NDArray[np.uint64], j: int) -> int:
+def popcount(x: np.uint64) -> int:
+    """How many bits of a word are set."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@kernel
+def lowest_byte(word: np.uint64) -> int:
+    """Index of the lowest byte that is not 0: zero bits below the lowest one, divided by 8.
+
+    In memory it is the first, on processors that store words lowest byte first.
+    """
+    return popcount((word & (~word + np.uint64(1))) - np.uint64(1)) >> 3
+
+
+@kernel
+def hamming(a: Words, i: int, b: Words, j: int) -> int:
     """Σ_k popcount(a[i, k] xor b[j, k]) over the four words of two descriptors."""
     total = 0
     for k in range(4):
-        x = a[i, k] ^ b[j, k]
-        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-        x = (x & np.uint64(0x3333333333333333)) + (
-            (x >> np.uint64(2)) & np.uint64(0x3333333333333333)
-        )
-        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-        total += int((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+        total += popcount(a[i, k] ^ b[j, k])
     return total
 
 
@@ -143,11 +157,11 @@ def search_lines(
             near[j] = off * off <= limits[j] * norm
         best, second_best, index, rival = NO_DISTANCE, NO_DISTANCE, -1, -1
         for word in range(len(words)):
-            if words[word] == 0:
-                continue
-            for j in range(8 * word, min(8 * word + 8, number)):
-                if near[j] == 0:
-                    continue
+            rest = words[word]
+            while rest != 0:
+                byte = lowest_byte(rest)
+                rest &= ~(np.uint64(255) << np.uint64(8 * byte))
+                j = 8 * word + byte
                 d = hamming(first, i, second, j)
                 if d < distances[j]:
                     distances[j], owner[j] = d, i
