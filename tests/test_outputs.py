@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import odomap.outputs
 from odomap.errors import OutputError
 from odomap.files.mapfile import load_map
 from odomap.logbook import Logbook
-from odomap.outputs import Outputs, counts_of
+from odomap.outputs import Outputs
 from odomap.sources.open import open as open_source
 from odomap.system.config import preset
 from odomap.system.odometry import make_odometry
@@ -65,7 +64,7 @@ def test_the_map_is_written_after_the_paths(tmp_path, tracked):
 
 
 def test_a_map_that_cannot_be_written_keeps_nothing_else_from_being(tmp_path, tracked, monkeypatch):
-    def refuse(path, *_):
+    def refuse(path, *_, **__):
         raise OutputError(f"{path}: cannot be written: the disk is full")
 
     monkeypatch.setattr(odomap.outputs, "save_map", refuse)
@@ -78,14 +77,15 @@ def test_a_map_that_cannot_be_written_keeps_nothing_else_from_being(tmp_path, tr
 
 
 def test_what_mapping_counts_is_told_where_it_counts(tmp_path, tracked):
-    found = tracked[1]
-    fields = {f.name: getattr(found, f.name) for f in dataclasses.fields(found)}
-    counted = SimpleNamespace(**fields | {"mapping": {"fused": np.int64(4)}}, truth=found.truth)
-    assert counts_of(counted) == {"fused": 4}
-    assert counts_of(SimpleNamespace()) is None
+    counted = dataclasses.replace(tracked[1], mapping={"landmarks_fused": np.int64(4)})
     write(tmp_path, tracked, counted)
-    assert json.loads((tmp_path / "metrics.json").read_text())["mapping"] == {"fused": 4}
-    assert "What mapping did" in (tmp_path / "report.html").read_text("utf-8")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["mapping"] == {"landmarks_fused": 4}
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert "<td>landmarks fused</td>" in page
+    write(tmp_path, tracked)
+    assert json.loads((tmp_path / "metrics.json").read_text())["mapping"] is None
+    assert "What mapping did" not in (tmp_path / "report.html").read_text("utf-8")
 
 
 def test_the_report_shows_how_the_map_grew(tmp_path, tracked):
@@ -93,4 +93,4 @@ def test_the_report_shows_how_the_map_grew(tmp_path, tracked):
     page = (tmp_path / "report.html").read_text("utf-8")
     assert '<section id="map"' in page
     assert "How it grew" in page
-    assert "The map from above" in page
+    assert "Seen from above, along" in page

@@ -26,7 +26,7 @@ from odomap.version import __version__
 if TYPE_CHECKING:
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.odometry import Result
+    from odomap.system.visual import Result
     from odomap.views.record import Report
 
 __all__ = ["Outputs"]
@@ -118,7 +118,7 @@ class Outputs:
         """
         self._close_live()
         failures: list[OutputError] = []
-        metrics["mapping"] = counts_of(result)
+        metrics["mapping"] = {name: int(n) for name, n in result.mapping.items()} or None
         metrics["map_bytes"] = None  # until the map is there
         jobs: list[tuple[str, Callable[[], object]]] = [
             ("trajectory.tum", lambda: write_tum(self._at("trajectory.tum"), result.trajectory)),
@@ -236,12 +236,6 @@ class Outputs:
             self._part.unlink(missing_ok=True)
         except OSError:
             return  # nothing more can be done with it, and the final path does not need it
-
-
-def counts_of(result: "Result") -> dict[str, int] | None:
-    """Return what local mapping made and dropped, by name; None where it does not count."""
-    counts: Mapping[str, int] | None = getattr(result, "mapping", None)
-    return {name: int(number) for name, number in counts.items()} if counts else None
 
 
 def _row(estimate: Estimate) -> str:
