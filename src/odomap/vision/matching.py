@@ -7,7 +7,7 @@ l = [t]_x R x passes a χ² test, (l · x')² <= 3.84 σ² (l_1² + l_2²); with
 compared. A match must be clearly better than the second best (Lowe's ratio) and be the best seen
 from both sides. Of equal ones the first counts.
 
-Cost: guided, O(landmarks x features in the circle); otherwise O(N M): along epipolar lines 0.4 ns a
+Cost: guided, O(landmarks x features in the circle); otherwise O(N M): along epipolar lines 1 ns a
 pair, all distances 3 ns a pair.
 
 Reference: Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, section
