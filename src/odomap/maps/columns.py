@@ -75,7 +75,9 @@ def members(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.int64]:
     return np.flatnonzero(is_member)
 
 
-def positions(values: NDArray[np.int64], of: NDArray[np.int64]) -> NDArray[np.int64]:
+def positions(
+    values: NDArray[np.int64] | NDArray[np.int32], of: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Return where each of (N,) row numbers stands in the (M,) distinct ones `of`, -1 if nowhere.
 
     O(N + M + largest).

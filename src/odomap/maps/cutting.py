@@ -50,8 +50,8 @@ class Cut:
     anchors: Placement
     p_anchor: NDArray[np.float64]
     indptr: NDArray[np.int64]
-    obs_slot: NDArray[np.int64]
-    obs_keypoint: NDArray[np.int64]
+    obs_slot: NDArray[np.int32]
+    obs_keypoint: NDArray[np.int32]
     version: int
     epoch: int
 
@@ -73,7 +73,7 @@ def snapshot_from(cut: Cut) -> Snapshot:
         points_world=act(cut.anchors, cut.p_anchor),
         obs_keyframe=keyframe[used],
         obs_landmark=landmark[used],
-        obs_keypoint=cut.obs_keypoint[used],
+        obs_keypoint=cut.obs_keypoint[used].astype(np.int64),
         anchor_id=int(fixed[0]) if len(fixed) else int(cut.ids[0]),
         version=cut.version,
         epoch=cut.epoch,

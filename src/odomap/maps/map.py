@@ -217,7 +217,7 @@ class Map(Surroundings):
         if self._observations.count_of(seeing).sum() > most:
             return None
         indptr, rows = self._observations.of_keyframes(seeing)
-        _, obs_slot, obs_keypoint = self._observations.read(rows)
+        obs_slot, obs_keypoint = self._observations.sights(rows)
         slots = members(obs_slot[: indptr[min(num_free, len(seeing))]])
         anchors = self._landmarks.anchor.take(slots).astype(np.int64)
         return Cut(
@@ -255,6 +255,6 @@ class Map(Surroundings):
     def _drop_observations_of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Remove all observations of keyframes, and return the slots of what they saw."""
         _, rows = self._observations.of_keyframes(keyframes)
-        slots = self._observations.seen(rows)
+        slots = self._observations.sights(rows)[0].astype(np.int64)
         self._observations.remove(rows)
         return slots

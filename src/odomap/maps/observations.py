@@ -104,9 +104,11 @@ class Observations:
         """Return the (N,) keyframes and keypoints of (N,) rows."""
         return self._keyframe.take(rows), self._keypoint.take(rows)
 
-    def seen(self, rows: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the (N,) landmark slots of (N,) rows."""
-        return self._landmark.take(rows).astype(np.int64)
+    def sights(
+        self, rows: NDArray[np.int64] | NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return the (N,) landmark slots and keypoints of (N,) rows."""
+        return self._landmark.take(rows), self._keypoint.take(rows)
 
     def of_keyframes(
         self, keyframes: NDArray[np.int64]
@@ -174,10 +176,11 @@ class Observations:
         last = np.zeros(len(landmarks), np.bool_)
         last[len(landmarks) - 1 - np.unique(landmarks[::-1], return_index=True)[1]] = True
         landmarks, keypoints = landmarks[last], keypoints[last]
-        known = self.find(np.full(len(landmarks), keyframe), landmarks)
-        old = known >= 0
-        self._keypoint[known[old]] = keypoints[old]
-        landmarks, keypoints = landmarks[~old], keypoints[~old]
+        if self.count_of(np.array([keyframe]))[0]:  # a new keyframe has none to be looked for
+            known = self.find(np.full(len(landmarks), keyframe), landmarks)
+            old = known >= 0
+            self._keypoint[known[old]] = keypoints[old]
+            landmarks, keypoints = landmarks[~old], keypoints[~old]
         rows = self._new_rows(len(landmarks))
         self._keyframe[rows] = keyframe
         self._landmark[rows] = landmarks

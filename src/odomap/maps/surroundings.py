@@ -47,7 +47,7 @@ class Surroundings(Sightings):
         """Return the (n,) distinct landmarks that keyframes see, ascending; stubs see none."""
         with self.lock:
             _, rows = self._observations.of_keyframes(self._all_known(keyframe_ids))
-            seen = self._landmarks.ids[members(self._observations.seen(rows))]
+            seen = self._landmarks.ids[members(self._observations.sights(rows)[0])]
         return np.sort(seen)
 
     def near(

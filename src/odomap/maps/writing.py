@@ -81,11 +81,12 @@ def move_landmarks(
     slots = landmarks.slots(ids)
     alive = slots >= 0
     ids, slots, points = ids[alive], slots[alive], np.asarray(update.points_world)[alive]
-    inherited = landmarks.ids[slots] != ids
-    order = np.argsort(inherited, kind="stable")
-    _, first = np.unique(slots[order], return_index=True)
-    chosen = order[first]
-    slots, points = slots[chosen], points[chosen]
+    if not (slots[1:] > slots[:-1]).all():  # some were fused, or the order is another
+        inherited = landmarks.ids[slots] != ids
+        order = np.argsort(inherited, kind="stable")
+        _, first = np.unique(slots[order], return_index=True)
+        chosen = order[first]
+        slots, points = slots[chosen], points[chosen]
     if C is not None:
         points = act(C, points)
     anchors = states.placements(landmarks.anchor[slots].astype(np.int64))
