@@ -49,6 +49,8 @@ Array = NDArray[np.float64]
 
 DRAW_EVERY_S = 0.08
 MAP_EVERY_S = 0.5
+REST = 5.0
+"""The thread of the view rests for so many times as long as it has drawn."""
 MESSAGES = 1024
 """Estimates that may wait to be drawn."""
 RECENT = 4
@@ -154,8 +156,12 @@ class View:
     def _draw_on(self) -> None:
         drawing, over = self._drawing, self._over
         try:
-            while not over.wait(DRAW_EVERY_S):
-                drawing.go_on(time.perf_counter())
+            pause = DRAW_EVERY_S
+            while not over.wait(pause):
+                start = time.perf_counter()
+                drawing.go_on(start)
+                # Where the machine is busy, a run comes before its picture.
+                pause = max(DRAW_EVERY_S, REST * (time.perf_counter() - start))
         except Exception as error:
             logging.getLogger(__name__).error(
                 "the view has stopped; the run goes on", exc_info=error

@@ -27,8 +27,8 @@ def test_inliers_and_outliers_are_told_apart():
 
 
 def test_a_large_image_is_shrunk_with_its_tracks():
-    drawn = picture(np.zeros((400, 1600), np.uint8), tracks([(800, 200)], [(780, 200)], [True]))
-    assert drawn.shape == (200, 800, 3)
+    drawn = picture(np.zeros((320, 1280), np.uint8), tracks([(800, 200)], [(780, 200)], [True]))
+    assert drawn.shape == (160, 640, 3)
     assert has(drawn, 400, 100, INLIER)
 
 

@@ -17,7 +17,7 @@ INLIER = (53, 224, 161)
 OUTLIER = (255, 84, 60)
 """Colours, RGB; shape tells as well for those who cannot tell them apart."""
 
-WIDEST_PX = 800
+WIDEST_PX = 640
 TRACKS = 2000
 """At most so many points are drawn."""
 LONGEST_TRAIL = 0.25
@@ -36,7 +36,7 @@ def picture(image: NDArray[np.uint8], tracks: Tracks | None) -> NDArray[np.uint8
         tracks: points of this image, or None to show it bare.
 
     Returns:
-        (h, w, 3) uint8 RGB, at most 800 wide.
+        (h, w, 3) uint8 RGB, at most 640 wide.
     """
     small = shrunk(image, WIDEST_PX)
     coloured = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB) if small.ndim == 2 else small.copy()

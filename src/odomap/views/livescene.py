@@ -40,7 +40,7 @@ FRUSTUM_IMAGE_PX = 320
 WIDEST_VIEW = 1.2
 """Frusta are at most so wide at distance 1, also those of a fisheye."""
 
-KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.07, 0.005
+KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.07, 0.003
 """Sizes as shares of the distance to what the camera sees."""
 
 
