@@ -64,8 +64,7 @@ def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
     title = "From the side" if place.up_axis in axes else "From above"
     ax = dress(figure.subplots(), title, *names)
     keyframes = _moved(place, view.keyframes)[:, axes]
-    landmarks = _moved(place, view.landmarks)
-    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
+    landmarks = _near(place, _moved(place, view.landmarks))
     dots = landmarks[thin(len(landmarks), LANDMARKS)][:, axes]
     _dots(ax, dots, 1.7, color=PALETTE["muted"], alpha=0.5, zorder=1)
     _joins(ax, keyframes, view)
@@ -124,7 +123,7 @@ def _joins(ax: Axes, keyframes: NDArray[np.float64], view: MapView) -> None:
 def _dots(ax: Axes, points: NDArray[np.float64], size: float, **style: Any) -> None:
     """Draw round dots, as strokes too short to be seen with round ends."""
     if len(points):
-        short = np.array([1e-4 * float(np.ptp(points)) + 1e-9, 0.0])
+        short = np.array([1e-6 * max(float(np.ptp(points)), 1e-3), 0.0])
         _strokes(ax, np.stack([points, points + short], axis=1), lw=size, **style)
 
 
@@ -135,15 +134,27 @@ def _strokes(ax: Axes, ends: NDArray[np.float64], **style: Any) -> None:
     ax.add_patch(PathPatch(path, fill=False, capstyle="round", **style))
 
 
-def _window(ax: Axes, place: Scene, landmarks: NDArray[np.float64], axes: tuple[int, int]) -> None:
-    """Show the whole path, and around it what is near enough to be told apart."""
-    path = place.positions if place.truth is None else np.r_[place.positions, place.truth]
-    low, high = path.min(axis=0), path.max(axis=0)
+def _near(place: Scene, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points that are near enough to the path to be told apart from each other."""
+    low, high = _extent(place)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1.0)
-    near = landmarks[np.linalg.norm(landmarks - (low + high) / 2, axis=1) < REACH * radius]
+    finite = points[np.isfinite(points).all(axis=1)]
+    near: NDArray[np.bool_] = np.linalg.norm(finite - (low + high) / 2, axis=1) < REACH * radius
+    kept: NDArray[np.float64] = finite[near]
+    return kept
+
+
+def _extent(place: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    path = place.positions if place.truth is None else np.r_[place.positions, place.truth]
+    return path.min(axis=0), path.max(axis=0)
+
+
+def _window(ax: Axes, place: Scene, landmarks: NDArray[np.float64], axes: tuple[int, int]) -> None:
+    """Show the whole path, and around it nearly all landmarks."""
+    low, high = _extent(place)
     low, high = low[list(axes)], high[list(axes)]
-    if len(near):
-        usual = np.percentile(near[:, axes], [USUAL, 100.0 - USUAL], axis=0)
+    if len(landmarks):
+        usual = np.percentile(landmarks[:, axes], [USUAL, 100.0 - USUAL], axis=0)
         low, high = np.minimum(low, usual[0]), np.maximum(high, usual[1])
     _frame(ax, (low + high) / 2, 1.08 * np.maximum(high - low, 1e-3))
 
