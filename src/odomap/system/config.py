@@ -115,7 +115,10 @@ def _mono_orb() -> Config:
 
 
 def _rgbd_orb() -> Config:
-    return Config(tracking=TrackingConfig(sensors="rgbd", association="descriptors"))
+    return Config(
+        tracking=TrackingConfig(sensors="rgbd", association="descriptors"),
+        noise=NoiseConfig(position_px=1.2),
+    )
 
 
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(

@@ -50,6 +50,7 @@ class MapTracker(Tracker[LocalMap]):
         keyframes: makes keyframes.
         start: makes the first ones.
         config: all sections.
+        recognizer: finds views in the whole map.
         is_mapping: whether keyframes are made.
     """
 
@@ -61,6 +62,7 @@ class MapTracker(Tracker[LocalMap]):
         keyframes: Keyframes,
         start: Start,
         config: Config,
+        recognizer: Recognizer,
         is_mapping: bool = True,
     ) -> None:
         super().__init__(map, eye, association, start, config.tracking)
@@ -68,14 +70,8 @@ class MapTracker(Tracker[LocalMap]):
         self._locator = MapLocator(
             eye.camera, eye.T_body_camera, config.orb, config.matching, config.local, config.noise
         )
-        self._recognizer = Recognizer(
-            map,
-            eye.camera,
-            eye.T_body_camera,
-            config.matching,
-            config.tracking.min_inliers,
-            config.orb.scale,
-        )
+        self._recognizer = recognizer
+        self._is_given = map.num_keyframes > 0
         self._local: LocalMap | None = None
         self._epoch = map.epoch
         self._shown = np.empty(0, np.int64)
@@ -129,17 +125,38 @@ class MapTracker(Tracker[LocalMap]):
     def _try(self, view: View, known: LocalMap, T_world_body: Array, needed: int) -> Located:
         return self._locator.locate(view, known, known.rows_of(self._shown), T_world_body, needed)
 
+    def _begin(self, look: Look) -> Estimate:
+        """Start; in a map that was there before, where the view is recognised."""
+        if not self._is_given:
+            return super()._begin(look)
+        found = self._recognised(look.view)
+        look.clock.lap("recognise")
+        if isinstance(found, str):
+            return self._lose(look.frame, f"not recognised: {found}", look.clock)
+        known, located = found
+        if located.num_inliers < self._tracking.min_inliers:
+            reason = f"{located.num_inliers} inliers of {self._tracking.min_inliers} needed"
+            return self._lose(look.frame, f"not recognised: {reason}", look.clock)
+        self._since_keyframe = 0
+        return self._accept(look, known, located, Status.RECOVERED)
+
     def _without_guess(self, view: View, known: LocalMap) -> tuple[LocalMap, Located] | None:
         """Look the view up in the whole map."""
+        found = self._recognised(view)
+        return None if isinstance(found, str) else found
+
+    def _recognised(self, view: View) -> tuple[LocalMap, Located] | str:
+        """Place a view by what it shows alone; or say why that cannot be."""
+        near = self.path.last_pose() @ self._eye.T_body_camera if len(self.path) else None
         found = self._recognizer.find(
             view.descriptors,
             view.corners.keypoints,
             view.corners.level,
             view.frame_id,
-            guess=self.path.last_pose() @ self._eye.T_body_camera,
+            guess=near,
         )
         if isinstance(found, str):
-            return None
+            return found
         T_world_body = found.T_world_camera @ se3_inverse(self._eye.T_body_camera)
         self._turn_to(found.keyframe_id, T_world_body)
         assert self._local is not None

@@ -16,6 +16,7 @@ T-RO 2015; Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017.
 
 from collections.abc import Mapping
 
+from odomap.errors import ConfigError
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config, make_association, preset, preset_for
@@ -24,6 +25,8 @@ from odomap.system.keyframing import Keyframes
 from odomap.system.localmapping import LocalMapper, MappingSections
 from odomap.system.maptracking import MapTracker
 from odomap.system.path import Path
+from odomap.system.recognisedstart import RecognisedStart
+from odomap.system.recognition import Recognizer
 from odomap.system.stages import Stages
 from odomap.system.starting import make_start
 from odomap.system.visual import Sight, VisualSystem
@@ -64,19 +67,37 @@ class Slam(VisualSystem):
 
     def _stages(self, sight: Sight, config: Config) -> Stages:
         eye, ranger = sight.eye, sight.ranger
+        follows = config.tracking.association == "flow"
+        if follows and not self._is_mapping:
+            raise ConfigError(
+                "tracking.association: optical flow follows keyframes, and none are made where the "
+                "map is not to change: use 'descriptors'"
+            )
         association = make_association(config, eye.mask, describes=True)
         bias = sight.depth_bias(config.noise)
         keyframes = Keyframes(self.map, eye, ranger, bias, association, config)
         start = make_start(self.map, eye, keyframes, association, config)
+        recognizer = Recognizer(
+            self.map,
+            eye.camera,
+            eye.T_body_camera,
+            config.matching,
+            config.tracking.min_inliers,
+            config.orb.scale,
+        )
+        if follows and self.map.num_keyframes:
+            start = RecognisedStart(self.map, eye, keyframes, recognizer, config.orb)
         parts = self.map, eye, association, keyframes, start, config
-        follows = config.tracking.association == "flow"
-        self._tracker = KeyframeTracker(*parts) if follows else MapTracker(*parts, self._is_mapping)
+        self._tracker: KeyframeTracker | MapTracker = (
+            KeyframeTracker(*parts) if follows else MapTracker(*parts, recognizer, self._is_mapping)
+        )
         depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
         sections = _sections(config)
         self._mapper = LocalMapper(
             self.map, eye.camera, eye.T_body_camera, sections, bias, *depth, ranger is not None
         )
-        return Stages(self.map, self._tracker, self._mapper)
+        mapper = self._mapper if self._is_mapping else None
+        return Stages(self.map, self._tracker, mapper)
 
     @property
     def _path(self) -> Path:
