@@ -114,8 +114,22 @@ def test_a_dump_that_fails_leaves_nothing_behind(monkeypatch, small_steps):
     monkeypatch.setattr(maps, "time", SimpleNamespace(sleep=interrupted))
     with pytest.raises(KeyboardInterrupt):
         m.dump()
-    followed = [c.is_followed for c in (*m._landmarks.columns(), *m._observations.columns())]
-    assert not any(followed)
+    assert not any_followed(m)
+    begin = Column.begin_copy
+
+    def without_memory(column):
+        if column.values.ndim == 2:
+            raise MemoryError
+        return begin(column)
+
+    monkeypatch.setattr(Column, "begin_copy", without_memory)
+    with pytest.raises(MemoryError):
+        m.dump()
+    assert not any_followed(m)
+
+
+def any_followed(m):
+    return any(c.is_followed for c in (*m._landmarks.columns(), *m._observations.columns()))
 
 
 def digest(m):

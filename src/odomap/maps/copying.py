@@ -11,7 +11,7 @@ Reference: M. H. Overmars, The design of dynamic data structures, 1983 (global r
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from odomap.maps.column import Column
+from odomap.maps.column import Column, Copy
 
 __all__ = ["Copying"]
 
@@ -22,8 +22,13 @@ STEP = 1 << 19
 class Copying:
     """A copy of columns in the making; hold the lock of their map for every call."""
 
-    def __init__(self, columns: Sequence[Column[Any]]) -> None:
-        self._jobs = [(column, column.begin_copy()) for column in columns]
+    def __init__(self) -> None:
+        self._jobs: list[tuple[Column[Any], Copy[Any]]] = []
+
+    def begin(self, columns: Sequence[Column[Any]]) -> None:
+        """Begin to copy; `close` ends what was begun, whatever happens."""
+        for column in columns:
+            self._jobs.append((column, column.begin_copy()))
 
     @property
     def is_nearly_done(self) -> bool:

@@ -74,9 +74,10 @@ class Map(Surroundings):
 
     def _twin(self) -> "Map":
         """Return the map as it is at one moment, to be read only; copied in small steps."""
-        with self.lock:
-            copying = Copying([*self._landmarks.columns(), *self._observations.columns()])
+        copying = Copying()
         try:
+            with self.lock:
+                copying.begin([*self._landmarks.columns(), *self._observations.columns()])
             while not self._is_nearly_copied(copying):
                 # The lock is not fair: without a pause it would be taken again before a thread
                 # that waits for it has woken.
