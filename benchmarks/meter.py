@@ -37,8 +37,8 @@ class Meter:
         self.threads = max(self.threads, thread_count())
         return result
 
-    def write(self, path: str | Path, tracked: int, cv_threads: int) -> None:
-        """Write what was measured as JSON."""
+    def write(self, path: str | Path, tracked: int, cv_threads: int, **more: Any) -> None:
+        """Write what was measured as JSON, and what else is told."""
         content = {
             "frames": len(self.ms),
             "tracked": tracked,
@@ -47,6 +47,7 @@ class Meter:
             "peak_memory_mb": peak_memory_mb(),
             "threads": self.threads,
             "cv_threads": cv_threads,
+            **more,
         }
         Path(path).write_text(json.dumps(content), encoding="utf-8")
 

@@ -46,7 +46,9 @@ def main() -> None:
     except SystemExit as end:
         if end.code:
             raise
-    meter.write(path, states.count("OK"), cv2.getNumThreads())
+    began = states.index("OK") if "OK" in states else len(states)
+    lost = len(states) - began - states.count("OK")
+    meter.write(path, states.count("OK"), cv2.getNumThreads(), lost=lost)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """What a player (`ours.py`, `peer_launcher.py`) leaves of one run over one recording."""
 
+import hashlib
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,8 @@ class Played:
         threads: the most that were alive after a frame.
         cv_threads: that OpenCV uses, as seen from Python.
         path: the TUM file of the trajectory.
+        lost: frames that could not be placed, once tracking had begun.
+        stall_ms: of each frame, what mapping beside the tracker cost it: waiting, reading, writing.
     """
 
     frames: int
@@ -40,6 +43,8 @@ class Played:
     threads: int
     cv_threads: int
     path: Path
+    lost: int = 0
+    stall_ms: list[float] = field(default_factory=list)
 
     def trajectory(self) -> Trajectory:
         """Return the path of the system."""
@@ -53,10 +58,11 @@ class Played:
         except OdomapError as why:
             print(f"no error can be computed: {why}", file=sys.stderr)
             error = float("inf")
-        return {
+        numbers = {
             "ate_m": error,
             "frames": self.frames,
             "tracked": self.tracked,
+            "lost": self.lost,
             "ms_mean": float(np.mean(counted)),
             "ms_median": float(np.median(counted)),
             "ms_p95": float(np.percentile(counted, 95)),
@@ -64,7 +70,16 @@ class Played:
             "peak_memory_mb": self.peak_memory_mb,
             "threads": self.threads,
             "cv_threads": self.cv_threads,
+            "digest": self.digest(),
         }
+        if self.stall_ms:
+            stalls = self.stall_ms[SKIPPED:] or self.stall_ms
+            numbers["stall_p99"] = float(np.percentile(stalls, 99))
+        return numbers
+
+    def digest(self) -> float:
+        """Return a number that two trajectories share if they have the same bytes."""
+        return float(int.from_bytes(hashlib.sha256(self.path.read_bytes()).digest()[:6], "big"))
 
 
 def play(command: list[str], prefix: Path, what: str) -> Played:

@@ -54,7 +54,7 @@ def test_peer_is_measured_without_odomap(load, folder, tmp_path):
     (tmp_path / "pyorbslam3.py").write_text(
         "class Slam:\n"
         "    def track_stereo(self, n):\n"
-        "        state = 'State.OK' if n else 'State.LOST'\n"
+        "        state = 'State.OK' if n % 2 else 'State.LOST'\n"
         "        return type('Result', (), {'state': state})\n"
     )
     script = tmp_path / "script.py"
@@ -76,7 +76,8 @@ def test_peer_is_measured_without_odomap(load, folder, tmp_path):
     played = load("played").play(
         [sys.executable, "-c", start, *launch], tmp_path / "x", "a stand-in"
     )
-    assert (played.frames, played.tracked, played.cv_threads) == (4, 3, 1)
+    assert (played.frames, played.tracked, played.cv_threads) == (4, 2, 1)
+    assert played.lost == 1  # the first one came before it had begun
     assert len(played.ms) == 4
     assert played.path.read_text() == "argument"
     assert played.peak_memory_mb > 1.0
@@ -86,10 +87,41 @@ def test_peer_is_measured_without_odomap(load, folder, tmp_path):
         assert "odomap" not in "".join(map(ast.unparse, imports))
 
 
-def test_ours_plays_a_recording(load, monkeypatch, tmp_path):
+def test_trajectories_of_the_same_bytes_share_a_number(load, tmp_path):
+    played = load("played")
+    runs = []
+    for name, path in (("a", some_path()), ("b", some_path()), ("c", some_path(19))):
+        write_tum(tmp_path / f"{name}.tum", path)
+        runs.append(played.Played(20, 20, [1.0], 1.0, 1.0, 1, 1, tmp_path / f"{name}.tum"))
+    a, b, c = (run.numbers(some_path())["digest"] for run in runs)
+    assert a == b != c
+
+
+def test_what_mapping_cost_the_tracker_is_a_percentile_after_warm_up(load, tmp_path):
+    played = load("played")
+    write_tum(tmp_path / "a.tum", some_path())
+    stalls = [500.0] * played.SKIPPED + [0.0] * 14 + [30.0]
+    run = played.Played(20, 20, [1.0], 1.0, 1.0, 1, 1, tmp_path / "a.tum", stall_ms=stalls)
+    assert 20.0 < run.numbers(some_path())["stall_p99"] <= 30.0
+    plain = played.Played(20, 20, [1.0], 1.0, 1.0, 1, 1, tmp_path / "a.tum")
+    assert "stall_p99" not in plain.numbers(some_path())
+
+
+def test_lost_frames_count_once_the_path_has_begun(load):
+    from odomap.maps.estimate import Status
+
+    begin, good, found, bad = Status
+    lost = load("ours").lost
+    assert lost([begin, begin, good, good]) == 0
+    assert lost([begin, good, bad, found, bad, begin, good]) == 3
+    assert lost([begin, begin]) == 0
+
+
+@pytest.mark.parametrize("system", [[], ["--odometry-only"]], ids=["SLAM", "odometry"])
+def test_ours_plays_a_recording(load, monkeypatch, tmp_path, system):
     world = World.make(kind="room", seed=1, frames=4, resolution=(320, 200))
     export_euroc(world, tmp_path / "room")
-    arguments = [str(tmp_path / "room"), str(tmp_path / "x"), "--frames", "3", "--fast"]
+    arguments = [str(tmp_path / "room"), str(tmp_path / "x"), "--frames", "3", "--fast", *system]
     monkeypatch.setattr(sys, "argv", ["ours.py", *arguments])
     load("ours").main()
     content = json.loads((tmp_path / "x.json").read_text())
