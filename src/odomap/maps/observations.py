@@ -162,31 +162,37 @@ class Observations:
         order = np.argsort(-counts[ids], kind="stable")
         return ids[order], counts[ids[order]]
 
-    def add(self, keyframe: int, landmarks: NDArray[np.int64], keypoints: NDArray[np.int64]) -> int:
-        """Add the observations of one keyframe; a pair already there takes the new keypoint.
+    def add(
+        self,
+        keyframes: NDArray[np.int64],
+        landmarks: NDArray[np.int64],
+        keypoints: NDArray[np.int64],
+    ) -> int:
+        """Add observations; a pair already there takes the new keypoint.
 
         Args:
-            keyframe: its id.
-            landmarks: (N,) slots; of one that comes twice the last keypoint counts.
-            keypoints: (N,) indices into the keyframe's features, -1 where there is none.
+            keyframes: (N,) ids.
+            landmarks: (N,) slots; of a pair that comes twice the last keypoint counts.
+            keypoints: (N,) indices into the keyframes' features, -1 where there is none.
 
         Returns:
             How many rows were added.
         """
-        last = np.zeros(len(landmarks), np.bool_)
-        last[len(landmarks) - 1 - np.unique(landmarks[::-1], return_index=True)[1]] = True
-        landmarks, keypoints = landmarks[last], keypoints[last]
-        if self.count_of(np.array([keyframe]))[0]:  # a new keyframe has none to be looked for
-            known = self.find(np.full(len(landmarks), keyframe), landmarks)
+        pair = keyframes << 32 | landmarks
+        last = np.zeros(len(pair), np.bool_)
+        last[len(pair) - 1 - np.unique(pair[::-1], return_index=True)[1]] = True
+        keyframes, landmarks, keypoints = keyframes[last], landmarks[last], keypoints[last]
+        if self.count_of(distinct(keyframes)).any():  # new keyframes have none to be looked for
+            known = self.find(keyframes, landmarks)
             old = known >= 0
             self._keypoint[known[old]] = keypoints[old]
-            landmarks, keypoints = landmarks[~old], keypoints[~old]
+            keyframes, landmarks, keypoints = keyframes[~old], landmarks[~old], keypoints[~old]
         rows = self._new_rows(len(landmarks))
-        self._keyframe[rows] = keyframe
+        self._keyframe[rows] = keyframes
         self._landmark[rows] = landmarks
         self._keypoint[rows] = keypoints
         self._alive[rows] = True
-        self._by_keyframe.append(np.full(len(rows), keyframe), rows.astype(np.int32))
+        self._by_keyframe.append(keyframes, rows.astype(np.int32))
         self._by_landmark.append(landmarks, rows.astype(np.int32))
         return len(rows)
 

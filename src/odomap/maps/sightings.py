@@ -17,7 +17,7 @@ from odomap.maps.landmarks import Landmarks
 from odomap.maps.observations import Observations
 from odomap.maps.skeleton import Skeleton
 from odomap.maps.states import act, act_inverse
-from odomap.maps.tree import STUB
+from odomap.maps.tree import ALIVE, STUB
 
 __all__ = ["Sightings"]
 
@@ -180,17 +180,17 @@ class Sightings(Skeleton):
             return self._landmarks.expected[self._living_slots(landmark_ids)].astype(np.int64)
 
     def add_observations(
-        self, keyframe_id: int, landmark_ids: ArrayLike, keypoints: ArrayLike
+        self, keyframe_ids: ArrayLike, landmark_ids: ArrayLike, keypoints: ArrayLike
     ) -> int:
-        """Say that a keyframe sees landmarks; a pair already there takes the new keypoint.
+        """Say that keyframes see landmarks; a pair already there takes the new keypoint.
 
         Landmarks that are gone are passed over, fused ones are seen as their survivors. Nothing is
-        added to a keyframe that was culled.
+        added to keyframes that were culled.
 
         Args:
-            keyframe_id: the keyframe.
+            keyframe_ids: (N,) keyframes, or one for all.
             landmark_ids: (N,) landmarks.
-            keypoints: (N,) indices into the keyframe's features, -1 for none.
+            keypoints: (N,) indices into the keyframes' features, -1 for none.
 
         Returns:
             How many observations are new.
@@ -200,10 +200,12 @@ class Sightings(Skeleton):
             points = self._ids(keypoints)
             if len(points) != len(slots):
                 raise ValueError(f"{len(slots)} landmarks but {len(points)} keypoints")
-            if self._known(keyframe_id) not in self._keyframes:
+            keyframes = np.broadcast_to(self._all_known(keyframe_ids), slots.shape)
+            good = (slots >= 0) & (self._tree.status[keyframes] == ALIVE)
+            if not (self._tree.status[self._ids(keyframe_ids)] == ALIVE).any():
                 return 0
             self.version += 1
-            return self._observations.add(keyframe_id, slots[slots >= 0], points[slots >= 0])
+            return self._observations.add(keyframes[good], slots[good], points[good])
 
     def remove_observations(self, keyframe_ids: ArrayLike, landmark_ids: ArrayLike) -> None:
         """Remove observations by N pairs of keyframe and landmark; absent ones are passed over."""

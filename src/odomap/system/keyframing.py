@@ -296,13 +296,17 @@ class Keyframes:
 
     def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:
         """Tell the map which earlier keyframes have seen new landmarks."""
-        for keyframe_id in np.unique(history.keyframes[history.keyframes >= 0]).tolist():
-            if not self._map.is_keyframe_alive(keyframe_id):
-                continue  # it was culled
-            if self._map.keyframe(keyframe_id).features is None:
-                continue  # it has left the window, and what it saw is forgotten
-            which, view = np.nonzero(history.keyframes == keyframe_id)
-            self._map.add_observations(keyframe_id, landmark_ids[which], history.rows[which, view])
+        seen_by = np.unique(history.keyframes[history.keyframes >= 0]).tolist()
+        # Those that were culled, or have left an odometry's window, know nothing any more.
+        known = [
+            k
+            for k in seen_by
+            if self._map.is_keyframe_alive(k) and self._map.keyframe(k).features is not None
+        ]
+        which, view = np.nonzero(np.isin(history.keyframes, known))
+        self._map.add_observations(
+            history.keyframes[which, view], landmark_ids[which], history.rows[which, view]
+        )
 
     def _reference(
         self,

@@ -143,7 +143,7 @@ class LocalMapper:
         ids, keyframes = change.snapshot.landmark_ids, change.snapshot.keyframe_ids
         fusions, adjusted = change.fusions, change.adjusted
         map.fuse_landmarks(ids[fusions.survivors], ids[fusions.gone])
-        _observe(map, keyframes, fusions.keyframe, ids[fusions.landmark], fusions.keypoint)
+        map.add_observations(keyframes[fusions.keyframe], ids[fusions.landmark], fusions.keypoint)
         map.apply(change.update)
         new = self._write_created(change, map)
         self._bias.learn(adjusted.solution, 1.0 / max(int((~change.window.is_fixed).sum()), 1))
@@ -243,10 +243,8 @@ class LocalMapper:
         ids = np.full(len(created), -1)
         ids[kept] = new
         good = ~adjusted.is_created_wrong & (ids[created.obs_point] >= 0)
-        _observe(
-            map,
-            keyframes,
-            created.obs_keyframe[good],
+        map.add_observations(
+            keyframes[created.obs_keyframe[good]],
             ids[created.obs_point[good]],
             created.obs_keypoint[good],
         )
@@ -282,15 +280,6 @@ class LocalMapper:
         self._drifts[newest] = change.drift
         covariance = self._calibration.total(change.drift, map.T_world_body(newest))
         map.set_covariance([newest], covariance)
-
-
-def _observe(
-    map: Map, keyframe_ids: Index, rows: Index, landmarks: Index, keypoints: Index
-) -> None:
-    """Add observations by row of keyframe, id of landmark, and keypoint."""
-    for k in np.unique(rows).tolist():
-        of = rows == k
-        map.add_observations(int(keyframe_ids[k]), landmarks[of], keypoints[of])
 
 
 def _descriptors(window: LocalWindow, created: Created) -> NDArray[np.uint8]:
