@@ -37,7 +37,9 @@ def figures(
     metrics: dict[str, Any] = {"name": source.name} | logbook.numbers() | skipped_numbers(source)
     # Frames that were placed later have a pose now.
     placed = set(result.trajectory.stamps_ns.tolist())
-    lost = [e for e in logbook.estimates if e.status == Status.LOST and e.stamp_ns not in placed]
+    # In a map there is no start to wait for: what is not placed is lost.
+    missed = {Status.LOST} if is_mapping else {Status.LOST, Status.INITIALIZING}
+    lost = [e for e in logbook.estimates if e.status in missed and e.stamp_ns not in placed]
     metrics["tracked"], metrics["lost"] = len(placed), len(lost)
     metrics["is_metric"] = result.is_metric
     metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
@@ -47,6 +49,7 @@ def figures(
     metrics["failure"] = logbook.failure(len(placed))
     if not is_mapping:
         metrics["localised"] = len(placed)
+        metrics["keyframes"] = result.map.num_keyframes
         metrics["failure"] = "" if placed else _unplaced(logbook)
     metrics["ate_rmse_m"] = None
     metrics["ate"] = None

@@ -27,7 +27,18 @@ __all__ = ["config_to_yaml", "field_docs", "override", "read_config", "updated"]
 
 T = TypeVar("T")
 
-HEADER = ("odomap_config", "odomap", "preset", "data", "rig", "rhythm", "max_frames", "command")
+HEADER = (
+    "odomap_config",
+    "odomap",
+    "preset",
+    "data",
+    "rig",
+    "rhythm",
+    "max_frames",
+    "command",
+    "map",
+    "is_mapping",
+)
 """Top-level keys of a config.yaml that say where it comes from; reading skips them."""
 
 
