@@ -164,7 +164,7 @@ def run(
     chosen_config(preset, config)  # a wrong name is told before anything is opened
     saved = None if map is None else SavedMap.of(map)
     source = data if isinstance(data, Source) else _opened(data, rig)
-    usual = None if saved is None else saved.sensors or None
+    usual = None if saved is None else saved.usual_preset(source.rig, is_mapping)
     settings = chosen_config(preset or usual, config, rig=source.rig)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
     head |= ({"preset": preset} if preset else {}) | dict(origin or {}) | {"rhythm": rhythm}

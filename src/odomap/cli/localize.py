@@ -44,11 +44,10 @@ class _WithMap:
         chosen_config(self.preset, self.config, self.overrides)  # names are checked first
         saved = SavedMap.load(self.map)
         source = open_source(self.data, self.rig)
-        preset = self.preset or saved.sensors or None
+        preset = self.preset or saved.usual_preset(source.rig, is_mapping)
         config = chosen_config(preset, self.config, self.overrides, source.rig)
         out = self.out or Path("runs") / f"{folder_name(source.name)}_{default}"
-        command: dict[str, object] = {"data": self.data}
-        command |= {"preset": preset} if preset else {}
+        command: dict[str, object] = {"data": self.data, "preset": preset}
         command |= {"rig": str(self.rig)} if self.rig else {}
         return track(
             source,
