@@ -1,6 +1,6 @@
 """Does tracking get slower while the map grows? A simulated street with 100 to 3,000 keyframes.
 
-    python benchmarks/growth.py [--presets stereo stereo-orb] [--sizes 100 300 1000 3000]
+    python benchmarks/growth.py [--presets stereo stereo-flow] [--sizes 100 300 1000 3000]
 
 Rendering 3,000 keyframes would take an hour, so a street is built of one stretch of it: that
 stretch is mapped by SLAM, and copies of what it left (keyframes with all their features, landmarks,
@@ -195,7 +195,7 @@ def main() -> int:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--presets", nargs="+", default=["stereo", "stereo-orb"])
+    parser.add_argument("--presets", nargs="+", default=["stereo", "stereo-flow"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[100, 300, 1000, 3000])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed", type=float, default=7.5, help="m/s")

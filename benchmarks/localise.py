@@ -1,6 +1,6 @@
 """A map saved, loaded, and localised in: even frames make it, odd frames are placed in it.
 
-    python benchmarks/localise.py --data DATA [--recordings rgbd_desk euroc_mh01] [--suffix -orb]
+    python benchmarks/localise.py --data DATA [--recordings rgbd_desk euroc_mh01] [--suffix=-flow]
 
 For each recording: SLAM over the even frames leaves a map; it is saved and loaded again; the odd
 frames, which it has never seen, are placed in it without changing it, the first one by recognition
@@ -47,7 +47,8 @@ def main() -> int:
     results: dict[str, dict[str, float]] = {}
     for name in options.recordings:
         source = open_source(Path(options.data) / name)
-        numbers = measure(source, preset(preset_for(source.rig) + options.suffix))
+        usual = preset_for(source.rig)
+        numbers = measure(source, preset(usual + options.suffix), preset(usual))
         print_numbers(name, numbers)
         missed += below_bars(name, numbers)
         results[name] = numbers
@@ -62,7 +63,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", default=os.environ.get("ODOMAP_DATA"))
     parser.add_argument("--recordings", nargs="+", default=["rgbd_desk", "euroc_mh01"])
-    parser.add_argument("--suffix", default="-orb", help="of the preset: how frames are tracked")
+    parser.add_argument("--suffix", default="", help="of the preset that maps: -flow")
     parser.add_argument("--json", help="write all numbers here")
     options = parser.parse_args()
     if not options.data:
@@ -73,12 +74,18 @@ def _options() -> argparse.Namespace:
     return options
 
 
-def measure(source: Source, config: Config) -> dict[str, float]:
-    """Map the even frames, save, load, localise the odd ones; return what is to be told."""
+def measure(source: Source, mapping: Config, placing: Config) -> dict[str, float]:
+    """Map the even frames, save, load, localise the odd ones; return what is to be told.
+
+    Args:
+        source: the recording.
+        mapping: how frames are tracked that make a map.
+        placing: how those are that are placed in it.
+    """
     ids = range(len(source))
     even, odd = drop(source, ids[1::2]), drop(source, ids[0::2])
-    whole = slam(source, config).finish().trajectory
-    made = slam(even, config)
+    whole = slam(source, mapping).finish().trajectory
+    made = slam(even, mapping)
     made.finish()
     with tempfile.TemporaryDirectory(prefix="odomap-localise-") as folder:
         first, again = Path(folder) / "first.odomap", Path(folder) / "again.odomap"
@@ -93,8 +100,7 @@ def measure(source: Source, config: Config) -> dict[str, float]:
             "load_s": load_s,
             "is_same_file": float(digest(first) == digest(again)),
         }
-        placed = slam(odd, config, loaded).finish().trajectory
-        save_map(again, loaded, source.rig)
+        placed = slam(odd, placing, loaded).finish().trajectory
         counted = {"seen", "expected"}  # how often landmarks are found is remembered
         numbers["is_unchanged"] = float(same(made.map, loaded, counted))
     return numbers | errors(placed, whole) | {"share": len(placed) / len(odd)}

@@ -22,6 +22,7 @@ from odomap.kernels import modules_with_kernels, warm_up
 from odomap.maps.estimate import Status
 from odomap.run import RHYTHM, chosen_config
 from odomap.sources.open import open as open_source
+from odomap.system.config import odometry_preset
 from odomap.system.odometry import make_odometry
 from odomap.system.rhythms import RHYTHMS
 from odomap.system.slam import Slam
@@ -55,7 +56,8 @@ def play(options: argparse.Namespace) -> None:
     assignments = [
         (name, value) for name, _, value in (text.partition("=") for text in options.set)
     ]
-    config = chosen_config(options.preset, None, assignments, source.rig)
+    usual = odometry_preset(source.rig) if options.odometry_only else None
+    config = chosen_config(options.preset or usual, None, assignments, source.rig)
     make = make_odometry if options.odometry_only else Slam
     system = make(source.rig, config, options.rhythm)
     imported = set(sys.modules)

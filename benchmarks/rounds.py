@@ -1,6 +1,6 @@
 """Does a map grow with the space seen, or with time? Ten rounds of one room say.
 
-    python benchmarks/rounds.py [--rounds 10] [--presets stereo stereo-orb ...] [--json FILE]
+    python benchmarks/rounds.py [--rounds 10] [--presets stereo stereo-flow ...] [--json FILE]
 
 A camera is carried round a simulated room again and again; no round is the same to the pixel (the
 hand sways, exposure and noise differ). What the map holds after the last round is compared with
@@ -38,7 +38,7 @@ from odomap.simulation.world import World
 from odomap.system.config import preset
 from odomap.system.slam import Slam
 
-PRESETS = ("stereo", "stereo-orb", "rgbd", "rgbd-orb", "mono", "mono-orb")
+PRESETS = ("stereo", "stereo-flow", "rgbd", "rgbd-flow", "mono", "mono-flow")
 LARGEST_GROWTH = 1.3
 GROWING = ("keyframes", "landmarks", "file_mb", "memory_mb")
 

@@ -1,7 +1,7 @@
 """odomap and ORB-SLAM3 on the same images at the pace of the sensor: error, time, memory, ratio.
 
     python benchmarks/sequences.py [--repeats 5] [--gate | --update-baseline] [--json FILE]
-                                   [--preset-suffix -orb | --preset NAME] [--odometry-only]
+                                   [--preset-suffix=-flow | --preset NAME] [--odometry-only]
 
 Needs --data, --peer-python and --peer-script, or the variables in `peer`. The systems run one
 after the other, each in its own process, alternating. Printed is the median over the repeats
@@ -144,7 +144,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--cv-threads", type=int, default=0, help="of Python's OpenCV, both sides")
     parser.add_argument("--odometry-only", action="store_true", help="ours without SLAM")
     parser.add_argument("--preset", help="of ours; default the one for the recording's sensors")
-    parser.add_argument("--preset-suffix", default="", metavar="-orb", help="added to it")
+    parser.add_argument("--preset-suffix", default="", metavar="-flow", help="added to it")
     parser.add_argument("--rhythm", choices=RHYTHMS, default=RHYTHM, help="of ours")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of ours")
     parser.add_argument("--score-script", default=os.environ.get("ODOMAP_SCORE_SCRIPT"))
@@ -208,7 +208,8 @@ def compare(
 def run_ours(options: argparse.Namespace, recording: Recording, data: Path, prefix: Path) -> Played:
     """Play a recording to odomap, in a process of its own."""
     command = [sys.executable, str(HERE / "ours.py"), str(data), str(prefix)]
-    preset = options.preset or recording.mode + options.preset_suffix
+    suffix = options.preset_suffix or ("-flow" if options.odometry_only else "")
+    preset = options.preset or recording.mode + suffix
     command += ["--preset", preset, "--rhythm", options.rhythm]
     command += ["--odometry-only"] if options.odometry_only else []
     command += ["--frames", str(options.frames), "--cv-threads", str(options.cv_threads)]

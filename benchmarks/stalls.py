@@ -1,7 +1,7 @@
 """What mapping costs the tracker: how long the map's lock is held, how long a frame waits.
 
     python benchmarks/stalls.py --data DATA [--recordings euroc_mh01 kitti_stereo ...]
-                                [--rhythms lockstep live] [--suffix -orb] [--repeats 3]
+                                [--rhythms lockstep live] [--suffix=-flow] [--repeats 3]
 
 Recordings are played at the pace of their sensor. Two figures, each the smallest of the repeats:
 
@@ -12,8 +12,11 @@ Recordings are played at the pace of their sensor. Two figures, each the smalles
            reading the map for the next job; the 99th percentile over frames and the longest. Bar
            on the percentile: 15 ms.
 
-Beside them, without a bar, how much longer placing a frame takes while a job is being solved in
-the other thread ("beside"): the difference of the medians. Exit code 1 where a bar is missed.
+Beside them, without a bar, what lies behind the stalls: reading, solving and writing of a job, of
+their own processor time, median and longest ("parts"; a change that is solved in less than is left
+of a frame's interval is not waited for); and how much longer placing a frame takes while a job is
+being solved in the other thread ("beside"): the difference of the medians. Exit code 1 where a bar
+is missed.
 """
 
 import argparse
@@ -22,15 +25,19 @@ import os
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import cv2
 import numpy as np
 from played import SKIPPED
 
 from odomap.kernels import modules_with_kernels, warm_up
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
 from odomap.sources.open import open as open_source
 from odomap.sources.source import Source
 from odomap.system.config import Config, preset
@@ -85,6 +92,55 @@ class TracedLock:
         self._lock.release()
 
 
+@dataclass
+class Parts:
+    """Own milliseconds of what a job is made of, job after job."""
+
+    read: list[float] = field(default_factory=list)
+    solve: list[float] = field(default_factory=list)
+    write: list[float] = field(default_factory=list)
+
+    def watch(self, mapper: Any) -> None:
+        """Have all jobs of a mapper timed."""
+        add = mapper.add
+
+        def watched(keyframe: Keyframe) -> "_Job | None":
+            job = timed(self.read, add, keyframe)
+            return None if job is None else _Job(self, job)
+
+        mapper.add = watched
+
+
+@dataclass(frozen=True)
+class _Job:
+    parts: Parts
+    job: Any
+
+    def solve(self) -> "_Change":
+        return _Change(self.parts, timed(self.parts.solve, self.job.solve))
+
+
+@dataclass(frozen=True)
+class _Change:
+    parts: Parts
+    change: Any
+
+    @property
+    def loops(self) -> Any:
+        return self.change.loops
+
+    def write(self, m: Map) -> None:
+        timed(self.parts.write, self.change.write, m)
+
+
+def timed(laps: list[float], call: Callable[..., Any], *args: Any) -> Any:
+    """Call something and note the processor time of this thread, in ms."""
+    start = time.thread_time()
+    result = call(*args)
+    laps.append(1e3 * (time.thread_time() - start))
+    return result
+
+
 @dataclass(frozen=True)
 class Costs:
     """What one run said.
@@ -98,6 +154,7 @@ class Costs:
         beside_ms: how much longer a frame is placed beside a job, median; NaN where that never was.
         beside: frames placed beside a job.
         frames: all that count.
+        parts: of every job, by name.
     """
 
     lock_ms: float
@@ -108,6 +165,7 @@ class Costs:
     beside_ms: float
     beside: int
     frames: int
+    parts: dict[str, list[float]]
 
 
 def main() -> int:
@@ -137,7 +195,7 @@ def _options() -> argparse.Namespace:
     known = [*SENSORS, "rgbd_desk"]
     parser.add_argument("--recordings", nargs="+", default=known, choices=known)
     parser.add_argument("--rhythms", nargs="+", default=["lockstep", "live"])
-    parser.add_argument("--suffix", default="", help="of the preset: -orb")
+    parser.add_argument("--suffix", default="", help="of the preset: -flow")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--frames", type=int, default=0, help="only the first ones")
     parser.add_argument("--json", help="write all numbers here")
@@ -151,6 +209,8 @@ def run(source: Source, config: Config, rhythm: str, frames: int = 0, paced: boo
     """Play a recording to SLAM at the pace of its sensor, and note what mapping costs."""
     system = Slam(source.rig, config, rhythm)
     system.map.lock = lock = TracedLock()  # type: ignore[assignment]
+    parts = Parts()
+    parts.watch(system.worker.stages.mapper)
     imported = set(sys.modules)
     for module in modules_with_kernels():
         if module in imported:
@@ -172,7 +232,7 @@ def run(source: Source, config: Config, rhythm: str, frames: int = 0, paced: boo
         stalls.append(timing.get("map", 0.0))
         placing.append(timing.get("prepare", 0.0) + timing.get("track", 0.0))
     system.finish()
-    return summary(lock, np.array(stalls), np.array(placing), np.array(is_beside))
+    return summary(lock, np.array(stalls), np.array(placing), np.array(is_beside), parts)
 
 
 def is_solving(system: Slam) -> bool:
@@ -184,7 +244,11 @@ def is_solving(system: Slam) -> bool:
 
 
 def summary(
-    lock: TracedLock, stalls: np.ndarray, placing: np.ndarray, is_beside: np.ndarray
+    lock: TracedLock,
+    stalls: np.ndarray,
+    placing: np.ndarray,
+    is_beside: np.ndarray,
+    parts: Parts,
 ) -> Costs:
     """Return the figures of a run from those of its frames."""
     stalls, placing, beside = stalls[SKIPPED:], placing[SKIPPED:], is_beside[SKIPPED:].astype(bool)
@@ -201,6 +265,7 @@ def summary(
         slower,
         int(beside.sum()),
         len(stalls),
+        vars(parts),
     )
 
 
@@ -226,6 +291,10 @@ def print_costs(what: str, runs: list[Costs]) -> None:
     print(f"{what}: {stall.frames} frames, best of {len(runs)}")
     print(f"  lock   {hold.lock_ms:7.2f} ms own time, {wall:.2f} ms on the wall, {hold.holder}")
     print(f"  stall  {stall.stall_p99:7.2f} ms p99, {stall.stall_max:.2f} ms longest")
+    for part in ("read", "solve", "write"):
+        middle = min(float(np.median(costs.parts[part] or [0.0])) for costs in runs)
+        worst = min(max(costs.parts[part], default=0.0) for costs in runs)
+        print(f"  {part:6} {middle:7.2f} ms median, {worst:.2f} ms longest, own time")
     print(f"  beside {stall.beside_ms:+7.2f} ms, of {stall.beside} frames", flush=True)
 
 
