@@ -21,6 +21,7 @@ from odomap.geometry.camera import Camera
 from odomap.limits import Count, NotNegative, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.maps.views import LandmarkViews
+from odomap.system.maplocating_kernels import foresee
 
 __all__ = ["Expected", "LocalMap", "LocalMapConfig", "expect", "local_map"]
 
@@ -80,7 +81,12 @@ class LocalMap:
 
     def rows_of(self, landmark_ids: Index) -> Index:
         """Return the rows of those of some landmarks (n,) that are here, ascending."""
-        return np.flatnonzero(np.isin(self.views.ids, landmark_ids))
+        if not len(self):
+            return np.empty(0, np.int64)
+        at = np.searchsorted(self.views.ids, landmark_ids).clip(0, len(self) - 1)
+        is_here = np.zeros(len(self), np.bool_)
+        is_here[at[self.views.ids[at] == landmark_ids]] = True
+        return np.flatnonzero(is_here)
 
 
 def local_map(
@@ -156,19 +162,22 @@ def expect(
         camera: the pinhole.
         level_scale, levels: of the pyramid.
     """
-    views = local.views
-    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    points = views.points_world[rows] @ R.T + t
-    depth = points[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    distance = np.linalg.norm(points, axis=1)
-    facing = np.sum((views.normals[rows] @ R.T) * points, axis=1) > SIDE * distance
-    with np.errstate(divide="ignore"):
-        closer = np.log(views.distance[rows] / distance) / np.log(level_scale)
-    level = views.level[rows] + closer
-    sized = (level > -1.5) & (level < levels + 0.5)
-    inside = camera.is_inside(np.nan_to_num(pixels, nan=-1.0), MARGIN_PX)
-    shown = np.flatnonzero((depth > 0.05) & inside & facing & sized)
-    predicted = np.rint(level[shown]).astype(np.int64).clip(0, levels - 1)
-    return Expected(rows[shown], points[shown], pixels[shown], predicted)
+    views, n = local.views, len(rows)
+    shown, points = np.empty(n, np.int64), np.empty((n, 3))
+    pixels, level = np.empty((n, 2)), np.empty(n, np.int64)
+    found = foresee(
+        views.points_world,
+        views.normals,
+        views.distance,
+        views.level,
+        np.ascontiguousarray(rows, np.int64),
+        np.ascontiguousarray(T_camera_world),
+        np.array([*camera.intrinsics, *camera.resolution], np.float64),
+        np.array([MARGIN_PX, SIDE, np.log(level_scale)]),
+        levels,
+        shown,
+        points,
+        pixels,
+        level,
+    )
+    return Expected(shown[:found], points[:found], pixels[:found], level[:found])

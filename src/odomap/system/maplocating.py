@@ -20,6 +20,7 @@ from odomap.geometry.lie import se3_inverse
 from odomap.system.association import View
 from odomap.system.localmap import LocalMap, LocalMapConfig, expect
 from odomap.system.locating import Located, variance_factor
+from odomap.system.maplocating_kernels import weigh
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.matching import KeypointGrid, MatchConfig, match_projected
@@ -50,6 +51,7 @@ class MapLocator:
         noise: NoiseConfig,
     ) -> None:
         self._camera, self._T_camera_body = camera, se3_inverse(T_body_camera)
+        self._pinhole = np.array([*camera.intrinsics, *camera.resolution], np.float64)
         self._orb, self._matching, self._search, self._noise = orb, matching, search, noise
 
     def locate(
@@ -75,7 +77,9 @@ class MapLocator:
         if int(solution.inliers.sum()) < needed or not solution.converged:
             return self._located(view, rows, found, solution, expected)
         rows, found = rows[solution.inliers], found[solution.inliers]
-        others = np.setdiff1d(np.arange(len(local)), rows)
+        is_other = np.ones(len(local), np.bool_)
+        is_other[rows] = False
+        others = np.flatnonzero(is_other)
         more, at, around = self._search_for(
             view, grid, local, others, solution.T_world_body, self._search.radius_px, found
         )
@@ -100,7 +104,7 @@ class MapLocator:
         index = match_projected(
             local.views.descriptors[there.rows],
             there.pixels,
-            radius_px * scale ** there.level.astype(np.float64),
+            (radius_px * scale ** np.arange(levels, dtype=np.float64))[there.level],
             there.level - 1,
             there.level + 1,
             view.descriptors,
@@ -111,36 +115,37 @@ class MapLocator:
         )
         matched = index >= 0
         if claimed is not None:
-            matched &= ~np.isin(index, claimed)
+            is_free = np.ones(len(view.descriptors), np.bool_)
+            is_free[claimed] = False
+            matched &= is_free[index]
         return there.rows[matched], index[matched], len(there.rows)
 
     def _solve(
         self, view: View, local: LocalMap, rows: Index, found: Index, T_world_body: Array
     ) -> MotionSolution:
         """Find the pose that agrees with matches of landmarks and features."""
-        camera, points = self._camera, local.views.points_world[rows]
-        pixels = view.corners.keypoints[found].astype(np.float64)
-        sigma = self._noise.position_px * self._orb.scale ** view.corners.level[found].astype(float)
-        sigma = np.hypot(sigma, self._slide(local, rows, T_world_body))
-        xy = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        weights = np.stack([camera.fx / sigma, np.ones(len(sigma))], axis=1)
-        none = np.full(len(rows), np.nan)
-        sightings = Sightings(points, xy, none, weights)
+        T_camera_world = self._T_camera_body @ se3_inverse(T_world_body)
+        levels = np.arange(self._orb.levels, dtype=np.float64)
+        n = len(rows)
+        points, xy, weights = np.empty((n, 3)), np.empty((n, 2)), np.empty((n, 2))
+        weigh(
+            local.views.points_world,
+            local.views.normals,
+            local.views.distance,
+            local.relative,
+            rows,
+            T_camera_world,
+            self._pinhole,
+            view.corners.keypoints,
+            view.corners.level,
+            found,
+            self._noise.feature_px * self._orb.scale**levels,
+            points,
+            xy,
+            weights,
+        )
+        sightings = Sightings(points, xy, np.full(n, np.nan), weights)
         return solve_motion(T_world_body, self._T_camera_body, UNIT_BASELINE, sightings)
-
-    def _slide(self, local: LocalMap, rows: Index, T_world_body: Array) -> Array:
-        """Return by how many pixels (n,) landmarks may be off since their depth is not exact.
-
-        An error of depth moves a landmark along the ray on which it was seen; here that moves its
-        projection, unless the camera looks along the same ray.
-        """
-        T = self._T_camera_body @ se3_inverse(T_world_body)
-        points = local.views.points_world[rows] @ T[:3, :3].T + T[:3, 3]
-        ray = local.views.normals[rows] @ T[:3, :3].T
-        depth = np.maximum(points[:, 2:], 1e-6)
-        across = np.linalg.norm(ray[:, :2] - points[:, :2] / depth * ray[:, 2:], axis=1)
-        error = np.minimum(local.relative[rows], 1.0) * local.views.distance[rows]
-        return np.asarray(self._camera.fx * across * error / depth[:, 0])
 
     def _located(
         self, view: View, rows: Index, found: Index, solution: MotionSolution, expected: int

@@ -184,10 +184,8 @@ def _on_level(
     """Return the features of one level, spread over it."""
     corners, scores = fast_corners(small, config.least_threshold, BORDER_PX)
     ratio = _ratio(image, small)
-    if mask is not None and len(corners):
-        x, y = ((corners[:, :2] + 0.5) * ratio).astype(np.int64).T
-        free = mask[np.minimum(y, mask.shape[0] - 1), np.minimum(x, mask.shape[1] - 1)]
-        corners = np.ascontiguousarray(corners[free])
+    if mask is not None:
+        corners = corners[: _keep_inside(corners, mask, float(ratio[0]), float(ratio[1]))]
     corners = corners[_choose(corners, small.shape, wanted, config.threshold)]
     angle, descriptors = rotated_brief(small, np.ascontiguousarray(corners[:, :2]))
     return OrbFeatures(
@@ -212,6 +210,23 @@ def _choose(
     chosen = np.empty(min(wanted, len(corners)), np.int64)
     found = _choose_kernel(corners, cell, cols, threshold, start, order, chosen)
     return chosen[:found]
+
+
+@kernel
+def _keep_inside(
+    corners: NDArray[np.int32], mask: NDArray[np.bool_], ratio_x: float, ratio_y: float
+) -> int:
+    """Move the corners whose pixel ((x + ½) r_x, (y + ½) r_y) is in the mask to the front."""
+    height, width = mask.shape
+    kept = 0
+    for i in range(len(corners)):
+        x = min(int((corners[i, 0] + 0.5) * ratio_x), width - 1)
+        y = min(int((corners[i, 1] + 0.5) * ratio_y), height - 1)
+        if mask[y, x]:
+            for k in range(3):
+                corners[kept, k] = corners[i, k]
+            kept += 1
+    return kept
 
 
 @kernel
@@ -293,4 +308,4 @@ def warm_up() -> None:
     """Compile the kernels of this module."""
     image = np.zeros((64, 64), np.uint8)
     image[30:, 30:] = 200
-    extract(image, OrbConfig(count=4, levels=1))
+    extract(image, OrbConfig(count=4, levels=1), np.ones(image.shape, np.bool_))
