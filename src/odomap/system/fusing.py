@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_inverse
 from odomap.limits import Limits, Positive, check_limits
-from odomap.system.fusing_kernels import expect, look
+from odomap.system.fusing_kernels import look, refind, stand_apart
 from odomap.system.joining import join
 from odomap.system.localwindow import LocalWindow
-from odomap.vision.matching import KeypointGrid, MatchConfig, match_projected
+from odomap.vision.hamming import as_words
+from odomap.vision.matching import MatchConfig
 
 __all__ = ["FuseConfig", "Fusions", "find_fusions", "fused"]
 
@@ -76,20 +77,26 @@ class _Window:
 
     Attributes:
         keypoint_of: (K, M) where each keyframe sees each landmark, −1 where it does not.
-        first: (K,) row of each keyframe's first keypoint in the following.
-        keypoints, levels, depth: (n, 2) float32, (n,) int64 and (n,), of all keyframes.
+        first: (K + 1,) where each keyframe's keypoints begin in the following.
+        keypoints, levels, depth, descriptors: (n, 2) float32, (n,) uint8, (n,) and (n, 32), of all
+            keyframes.
         look: (M, 4) per landmark the sum of unit vectors towards its observers, and the mean log
             of the distance at which it would show on the finest level; NaN where nobody sees it.
-        top: the coarsest level there is.
+        Ts_camera_world: (K, 4, 4).
+        pinhole: (6,) fx fy cx cy width height.
+        sizes: (levels,) of a pixel of each level there is, in those of the image.
     """
 
     keypoint_of: Index
     first: Index
     keypoints: NDArray[np.float32]
-    levels: Index
+    levels: NDArray[np.uint8]
     depth: Array
+    descriptors: NDArray[np.uint8]
     look: Array
-    top: int
+    Ts_camera_world: Array
+    pinhole: Array
+    sizes: Array
 
     @staticmethod
     def of(window: LocalWindow) -> "_Window":
@@ -97,21 +104,30 @@ class _Window:
         features = [window.features(k) for k in range(len(window.keyframes))]
         keypoint_of = np.full((len(features), len(window.points_world)), -1)
         keypoint_of[window.obs_keyframe, window.obs_landmark] = window.obs_keypoint
-        first = np.cumsum([0, *(len(f) for f in features)])[:-1]
-        levels = np.concatenate([f.level for f in features]).astype(np.int64)
+        first = np.cumsum([0, *(len(f) for f in features)])
+        levels = np.concatenate([f.level for f in features])
         seen = np.empty((len(window.points_world), 4))
         look(
             window.points_world,
             np.ascontiguousarray(window.Ts_world_camera[:, :3, 3]),
             window.obs_keyframe,
             window.obs_landmark,
-            levels[first[window.obs_keyframe] + window.obs_keypoint],
+            levels[first[window.obs_keyframe] + window.obs_keypoint].astype(np.int64),
             float(np.log(window.level_scale)),
             seen,
         )
-        keypoints = np.concatenate([f.keypoints for f in features])
-        depth, top = np.concatenate([f.depth for f in features]), int(levels.max(initial=0))
-        return _Window(keypoint_of, first, keypoints, levels, depth, seen, top)
+        return _Window(
+            keypoint_of,
+            first,
+            np.concatenate([f.keypoints for f in features]),
+            levels,
+            np.concatenate([f.depth for f in features]),
+            np.concatenate([f.descriptors for f in features]),
+            seen,
+            np.ascontiguousarray(se3_inverse(window.Ts_world_camera)),
+            np.array([*window.camera.intrinsics, *window.camera.resolution], np.float64),
+            window.level_scale ** np.arange(int(levels.max(initial=0)) + 1, dtype=np.float64),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,63 +159,51 @@ def find_fusions(window: LocalWindow, config: FuseConfig, matching: MatchConfig)
         New observations, and pairs of landmarks that are one.
     """
     laid = _Window.of(window)
-    sees = laid.keypoint_of >= 0
-    own = sees[window.newest]
-    hits = [_search(window, laid, window.newest, ~own, config, matching)]
-    others = [k for k in np.flatnonzero(~window.is_fixed).tolist() if k != window.newest]
-    hits += [_search(window, laid, k, own & ~sees[k], config, matching) for k in others]
-    return _resolved(window, laid, _gated(window, laid, [window.newest, *others], hits))
+    others = np.flatnonzero(~window.is_fixed)
+    searched = np.concatenate([[window.newest], others[others != window.newest]])
+    hits, expected = _search(window, laid, searched, config, matching)
+    return _resolved(window, laid, _gated(window, laid, hits, expected))
 
 
 def _search(
     window: LocalWindow,
     laid: _Window,
-    k: int,
-    wanted: Mask,
+    searched: Index,
     config: FuseConfig,
     matching: MatchConfig,
-) -> tuple[Index, Index, Array]:
-    """Look for landmarks of a (M,) mask in keyframe k: landmark, keypoint, u v 1/Z expected."""
-    camera, features, M = window.camera, window.features(k), len(wanted)
-    expected, level = np.empty((M, 3)), np.empty(M, np.int64)
-    expect(
+) -> tuple[Index, Array]:
+    """Look for landmarks in keyframes: keyframe, landmark, keypoint; u v 1/Z as expected."""
+    most = int(np.diff(laid.first)[searched].sum())  # no keypoint is given twice
+    hits, shown = np.empty((most, 3), np.int64), np.empty((most, 3))
+    found = refind(
+        searched,
+        window.newest,
+        laid.keypoint_of,
         window.points_world,
         laid.look,
-        wanted,
-        np.ascontiguousarray(se3_inverse(window.Ts_world_camera[k])),
-        np.array([*camera.intrinsics, *camera.resolution]),
+        as_words(window.descriptors),
+        laid.Ts_camera_world,
+        laid.pinhole,
         float(np.cos(np.radians(config.max_angle_deg))),
         float(np.log(window.level_scale)),
-        laid.top,
-        expected,
-        level,
+        config.radius_px * laid.sizes,
+        laid.first,
+        laid.keypoints,
+        laid.levels,
+        as_words(laid.descriptors),
+        matching.ratio,
+        matching.max_hamming,
+        hits,
+        shown,
     )
-    ahead = np.flatnonzero(level >= 0)
-    level, expected = level[ahead], expected[ahead]
-    keypoint = match_projected(
-        window.descriptors[ahead],
-        expected[:, :2],
-        config.radius_px * window.level_scale ** level.astype(np.float64),
-        np.maximum(level - 1, 0),
-        np.minimum(level + 1, laid.top),
-        features.descriptors,
-        features.keypoints,
-        features.level,
-        KeypointGrid.of(features.keypoints, (camera.height, camera.width)),
-        matching,
-    )
-    hit = np.flatnonzero(keypoint >= 0)
-    return ahead[hit], keypoint[hit], expected[hit]
+    return hits[:found], shown[:found]
 
 
-def _gated(
-    window: LocalWindow, laid: _Window, keyframes: list[int], hits: list[tuple[Index, Index, Array]]
-) -> _Found:
-    """Return what was found in keyframes near enough to where it was expected."""
-    keyframe = np.repeat(keyframes, [len(landmark) for landmark, _, _ in hits])
-    landmark, keypoint, expected = (np.concatenate(column) for column in zip(*hits, strict=True))
+def _gated(window: LocalWindow, laid: _Window, hits: Index, expected: Array) -> _Found:
+    """Return what was found near enough to where it was expected."""
+    keyframe, landmark, keypoint = np.ascontiguousarray(hits.T)
     at = laid.first[keyframe] + keypoint
-    sigma = window.sigma_px * window.level_scale ** laid.levels[at].astype(np.float64)
+    sigma = window.sigma_px * laid.sizes[laid.levels[at]]
     off = (laid.keypoints[at] - expected[:, :2]) / sigma[:, None]
     deep = (1.0 / laid.depth[at] - expected[:, 2]) / window.inverse_depth_sigma
     chi2 = np.sum(off * off, axis=1) + np.where(np.isfinite(deep), deep * deep, 0.0)
@@ -246,21 +250,19 @@ def _is_apart(window: LocalWindow, laid: _Window, a: Index, b: Index) -> Mask:
     Seen apart are two keypoints further from each other than the noise of two; the points are apart
     if in such a keyframe their projections are as well.
     """
-    here, there = laid.keypoint_of[:, a], laid.keypoint_of[:, b]
-    k, pair = np.nonzero((here >= 0) & (there >= 0) & (here != there))
-    rows = laid.first[k] + here[k, pair], laid.first[k] + there[k, pair]
-    level = np.maximum(laid.levels[rows[0]], laid.levels[rows[1]]).astype(np.float64)
-    noise = np.sqrt(2.0 * GATE) * window.sigma_px * window.level_scale**level
-    seen = np.linalg.norm(laid.keypoints[rows[0]] - laid.keypoints[rows[1]], axis=1)
-    Ts = se3_inverse(window.Ts_world_camera)
-    p, q = (
-        np.einsum("nij,nj->ni", Ts[k, :3, :3], window.points_world[m[pair]]) + Ts[k, :3, 3]
-        for m in (a, b)
+    pairs, apart = np.stack([a, b], axis=1), np.empty(len(a), np.bool_)
+    stand_apart(
+        pairs,
+        laid.keypoint_of,
+        laid.first,
+        laid.keypoints,
+        laid.levels,
+        np.sqrt(2.0 * GATE) * window.sigma_px * laid.sizes,
+        window.points_world,
+        laid.Ts_camera_world,
+        laid.pinhole,
+        apart,
     )
-    expected = np.linalg.norm(window.camera.project(p) - window.camera.project(q), axis=1)
-    apart = np.zeros(len(a), np.bool_)
-    # A point behind a camera that sees it projects to NaN, and is no evidence that they are one.
-    apart[pair[(seen > noise) & ~(expected <= noise)]] = True
     return apart
 
 

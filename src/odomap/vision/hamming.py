@@ -21,6 +21,7 @@ __all__ = [
     "CELL_PX",
     "NO_DISTANCE",
     "as_words",
+    "fill_cells",
     "hamming",
     "lowest_byte",
     "popcount",
@@ -78,6 +79,33 @@ def _cells_around(at: float, radius: float, count: int) -> tuple[int, int]:
     first = int(min(max((at - radius) / CELL_PX, 0.0), count - 1.0))
     last = int(min(max((at + radius) / CELL_PX, 0.0), count - 1.0))
     return first, last
+
+
+@kernel
+def fill_cells(keypoints: NDArray[np.float32], cols: int, start: Index, order: Index) -> None:
+    """Sort keypoints into cells of a grid, row by row; those outside go to the border's.
+
+    order[start[c]:start[c + 1]] are the keypoints of cell c, ascending.
+    """
+    cells = len(start) - 1
+    rows = cells // cols
+    of = np.empty(len(keypoints), np.int64)
+    for c in range(cells + 1):
+        start[c] = 0
+    for i in range(len(keypoints)):
+        x, y = keypoints[i, 0] / CELL_PX, keypoints[i, 1] / CELL_PX
+        col = int(min(x, cols - 1.0)) if x > 0.0 else 0
+        row = int(min(y, rows - 1.0)) if y > 0.0 else 0
+        of[i] = row * cols + col
+        start[of[i] + 1] += 1
+    for c in range(cells):
+        start[c + 1] += start[c]
+    for i in range(len(keypoints) - 1, -1, -1):
+        start[of[i] + 1] -= 1
+        order[start[of[i] + 1]] = i
+    for c in range(cells):
+        start[c] = start[c + 1]
+    start[cells] = len(keypoints)
 
 
 @kernel
@@ -192,6 +220,7 @@ def search_all(first: Words, second: Words, index: Index, best: Index, other: In
 
 
 def warm_up() -> None:
-    """Compile the kernel of this module."""
+    """Compile the kernels of this module."""
     words = as_words(np.zeros((1, 32), np.uint8))
     hamming(words, 0, words, 0)
+    fill_cells(np.zeros((1, 2), np.float32), 1, np.zeros(2, np.int64), np.zeros(1, np.int64))

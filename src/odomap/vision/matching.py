@@ -27,6 +27,7 @@ from odomap.vision.hamming import (
     CELL_PX,
     NO_DISTANCE,
     as_words,
+    fill_cells,
     search_all,
     search_circles,
     search_lines,
@@ -215,11 +216,9 @@ class KeypointGrid:
             shape: (H, W) of the image.
         """
         rows, cols = int(shape[0] / CELL_PX) + 1, int(shape[1] / CELL_PX) + 1
-        cells = (np.nan_to_num(keypoints) / CELL_PX).clip(0, [cols - 1, rows - 1]).astype(np.int64)
-        of = cells[:, 1] * cols + cells[:, 0]
-        start = np.zeros(rows * cols + 1, np.int64)
-        np.cumsum(np.bincount(of, minlength=rows * cols), out=start[1:])
-        return cls(start, np.argsort(of, kind="stable"), cols, rows)
+        start, order = np.empty(rows * cols + 1, np.int64), np.empty(len(keypoints), np.int64)
+        fill_cells(np.ascontiguousarray(keypoints, np.float32), cols, start, order)
+        return cls(start, order, cols, rows)
 
 
 @dataclass(frozen=True, eq=False)
