@@ -30,7 +30,7 @@ FILES = (
 def tracked():
     """A source, what was found in it, and the logbook."""
     source = open_source("sim:room?seed=3&frames=6&resolution=400x250")
-    system, book = make_odometry(source.rig, preset("stereo"), "inline"), Logbook(len(source))
+    system, book = make_odometry(source.rig, preset("stereo-flow"), "inline"), Logbook(len(source))
     book.map = system.map
     for frame in source:
         book.add(frame, system.track(frame), 0.01)
@@ -46,7 +46,7 @@ def numbers_of(result, book):
 def write(folder, tracked, result=None):
     source, found, book = tracked
     metrics = numbers_of(found, book)
-    outputs = Outputs(folder, preset("stereo"), {"data": source.name})
+    outputs = Outputs(folder, preset("stereo-flow"), {"data": source.name})
     outputs.write(source, result or found, book, metrics, [])
     return outputs, metrics
 

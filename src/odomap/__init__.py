@@ -3,7 +3,7 @@
     import odomap
 
     source = odomap.open("MH_01_easy")         # a recording's folder, or "sim:room?seed=3"
-    system = odomap.StereoVO(source.rig)
+    system = odomap.Slam(source.rig)
     for frame in source:
         estimate = system.track(frame)         # .T_world_body, .status, .reason, .covariance
     odomap.write_tum("poses.tum", system.finish().trajectory)
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from odomap.files.bal import read_bal, write_bal
     from odomap.files.calibrations import read_calibration
     from odomap.files.clouds import read_ply, write_ply
+    from odomap.files.colmap import write_colmap
     from odomap.files.g2o import read_g2o, write_g2o
     from odomap.files.graphs import read_graph, write_graph
     from odomap.files.mapfile import MapFile, load_map, save_map
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from odomap.geometry.pose import SE2, SE3, SO3, Sim3
     from odomap.geometry.robust import Loss
     from odomap.geometry.trajectory import Trajectory
+    from odomap.localize import continue_map, localize
     from odomap.maps.estimate import Estimate, Status
     from odomap.maps.map import Map
     from odomap.run import run
@@ -68,7 +70,10 @@ if TYPE_CHECKING:
     from odomap.sources.open import open
     from odomap.sources.source import Source
     from odomap.system.config import Config, preset
-    from odomap.system.odometry import MonocularVO, Result, RgbdVO, StereoVO
+    from odomap.system.odometry import MonocularVO, RgbdVO, StereoVO
+    from odomap.system.slam import Slam
+    from odomap.system.visual import Result
+    from odomap.viewing import View
 
 __all__ = [
     "SE2",
@@ -101,6 +106,7 @@ __all__ = [
     "Rig",
     "Sights",
     "Sim3",
+    "Slam",
     "Solution",
     "SolverConfig",
     "Source",
@@ -108,6 +114,7 @@ __all__ = [
     "StereoVO",
     "TrackingFailed",
     "Trajectory",
+    "View",
     "World",
     "__version__",
     "adjust",
@@ -115,10 +122,12 @@ __all__ = [
     "calibrate",
     "certify",
     "chordal_cost",
+    "continue_map",
     "covariances",
     "export",
     "joint_covariance",
     "load_map",
+    "localize",
     "open",
     "preset",
     "read_bal",
@@ -135,6 +144,7 @@ __all__ = [
     "solve",
     "view_covariance",
     "write_bal",
+    "write_colmap",
     "write_g2o",
     "write_graph",
     "write_ply",
@@ -165,7 +175,7 @@ _HOMES = {
     "OutputError": "errors",
     "PoseGraph": "backend.graphs.posegraph",
     "Priors": "backend.graphs.posegraph",
-    "Result": "system.odometry",
+    "Result": "system.visual",
     "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
     "SE2": "geometry.pose",
@@ -173,6 +183,7 @@ _HOMES = {
     "SO3": "geometry.pose",
     "Sights": "backend.graphs.posegraph",
     "Sim3": "geometry.pose",
+    "Slam": "system.slam",
     "Solution": "backend.graphs.solve",
     "SolverConfig": "backend.descent",
     "Source": "sources.source",
@@ -180,16 +191,19 @@ _HOMES = {
     "StereoVO": "system.odometry",
     "TrackingFailed": "errors",
     "Trajectory": "geometry.trajectory",
+    "View": "viewing",
     "World": "simulation.world",
     "adjust": "backend.adjustment.adjust",
     "ate": "evaluation.metrics",
     "calibrate": "calibrate",
     "certify": "backend.graphs.certificate",
     "chordal_cost": "backend.graphs.chordal",
+    "continue_map": "localize",
     "covariances": "backend.graphs.covariances",
     "export": "export",
     "joint_covariance": "backend.graphs.covariances",
     "load_map": "files.mapfile",
+    "localize": "localize",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
@@ -206,6 +220,7 @@ _HOMES = {
     "solve": "backend.graphs.solve",
     "view_covariance": "backend.adjustment.covariance",
     "write_bal": "files.bal",
+    "write_colmap": "files.colmap",
     "write_g2o": "files.g2o",
     "write_graph": "files.graphs",
     "write_ply": "files.clouds",

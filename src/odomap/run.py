@@ -21,6 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from odomap.choice import SystemChoice
 from odomap.errors import CalibrationError, InputError
 from odomap.figures import figures
 from odomap.geometry.trajectory import Trajectory
@@ -117,8 +118,9 @@ def run(
     view: "View | bool" = False,
     map: "SavedMap | Map | str | Path | None" = None,
     is_mapping: bool = True,
+    odometry_only: bool = False,
 ) -> RunResult:
-    """Track a recording from end to end, and write its results.
+    """Track and map a recording from end to end, and write its results.
 
     Args:
         data: a recording's folder, a world.yaml, "sim:room?seed=3&frames=100", or a `Source`.
@@ -135,6 +137,8 @@ def run(
         view: True shows the run in the browser while it lasts; a `View` stays open.
         map: a map, or a file of one, to begin with; default a new one.
         is_mapping: False only places frames in the map, which stays as it is.
+        odometry_only: True follows the path alone: what is behind is forgotten, no place is known
+            again.
 
     Returns:
         Trajectories, map, metrics; `failure` says why there is no usable path.
@@ -153,30 +157,28 @@ def run(
     from odomap.outputs import Outputs
     from odomap.savedmap import SavedMap
     from odomap.sources.source import Source
-    from odomap.system.rhythms import check_rhythm
     from odomap.system.worker import deferred_interrupt
     from odomap.viewing import check_view, watching
 
-    check_rhythm(rhythm)
     check_view(view)
     if max_frames is not None and max_frames < 1:
         raise InputError(f"max_frames is {max_frames}: at least 1 expected")
     chosen_config(preset, config)  # a wrong name is told before anything is opened
     saved = None if map is None else SavedMap.of(map)
+    choice = SystemChoice(rhythm, saved, is_mapping, odometry_only)
     source = data if isinstance(data, Source) else _opened(data, rig)
-    usual = None if saved is None else saved.usual_preset(source.rig, is_mapping)
-    settings = chosen_config(preset or usual, config, rig=source.rig)
+    usual = preset or choice.usual_preset(source.rig)
+    settings = chosen_config(usual, config, rig=source.rig)
+    choice.check(source.rig, settings)
     head: dict[str, object] = {"data": source.name if isinstance(data, Source) else str(data)}
-    head |= ({"preset": preset} if preset else {}) | dict(origin or {}) | {"rhythm": rhythm}
-    if saved is not None:
-        saved.check(source.rig, settings)
-        head |= {"map": saved.name, "is_mapping": is_mapping}
+    head |= ({"preset": preset} if preset else {}) | dict(origin or {}) | choice.head()
     outputs = Outputs(out, settings, head) if out is not None else None
 
     tell = progress or (lambda _: None)
     compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
-    system = _system(source, settings, rhythm, head, saved, is_mapping)
+    system = choice.make(source.rig, settings, head["data"])
+    logbook.map = None if odometry_only else system.map
     shown = watching(view, system, source.rig, settings)
     with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
@@ -237,7 +239,8 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
     By now the source is open and the system imported: what they did not import they do not need,
     but for geometry, which loads its kernels at their first use.
     """
-    import odomap.system.odometry  # noqa: F401 (loads the modules whose kernels a run needs)
+    import odomap.system.odometry
+    import odomap.system.slam  # noqa: F401 (they load the modules whose kernels a run needs)
     from odomap.kernels import modules_with_kernels, warm_up
 
     start = time.perf_counter()
@@ -248,30 +251,6 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
         tell(Progress("compiling", index, len(names), text=name))
         warm_up(name)
     return time.perf_counter() - start
-
-
-def _system(
-    source: "Source",
-    settings: "Config",
-    rhythm: str,
-    head: Mapping[str, object],
-    saved: "SavedMap | None",
-    is_mapping: bool,
-) -> "VisualSystem":
-    import cv2
-
-    from odomap.system.odometry import make_odometry
-
-    # The stages use the cores themselves; OpenCV's own threads would only get in their way.
-    cv2.setNumThreads(1)
-    try:
-        if saved is not None:
-            from odomap.system.slam import Slam
-
-            return Slam(source.rig, settings, rhythm, saved.map, is_mapping)
-        return make_odometry(source.rig, settings, rhythm)
-    except CalibrationError as error:
-        raise CalibrationError(f"{head['data']}: {error}") from error
 
 
 def _track(

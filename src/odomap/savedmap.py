@@ -69,22 +69,18 @@ class SavedMap:
             return map
         return cls("map", map) if isinstance(map, Map) else cls.load(map)
 
-    def usual_preset(self, rig: Rig, is_mapping: bool) -> str:
+    def usual_preset(self, rig: Rig) -> str:
         """Return the preset to use the map with where nobody says.
 
         Args:
             rig: what the recording carries.
-            is_mapping: False where no keyframes are made, that optical flow could start from:
-                descriptors are needed then.
 
         Raises:
             CalibrationError: there is no preset for the rig: it has no camera.
         """
-        from odomap.system.config import PRESETS, preset_for
+        from odomap.system.config import preset_for
 
-        name = self.sensors or preset_for(rig)
-        matching = f"{name}-orb"
-        return name if is_mapping or matching not in PRESETS else matching
+        return self.sensors or preset_for(rig)
 
     def check(self, rig: Rig, config: "Config") -> None:
         """Make sure that frames of a rig can be placed in the map.

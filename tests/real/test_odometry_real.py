@@ -91,7 +91,7 @@ def test_one_camera_of_a_drone(data_folder):
 def test_one_camera_of_a_car(data_folder):
     source = open_source(data_folder / "kitti_mono")
     assert preset_for(source.rig) == "mono"
-    estimates, result = run(source, make_odometry(source.rig, preset("mono")))
+    estimates, result = run(source, make_odometry(source.rig, preset("mono-flow")))
     starts_soon(estimates, 10)
     assert len(result.trajectory) >= 91
     assert ate(result.trajectory, source.truth, "sim3").rmse <= 0.20

@@ -33,7 +33,7 @@ def view_of(frame_id):
 class Oracle:
     """An association that knows where points are: it answers for what is near its guess."""
 
-    count = 300
+    count, follows = 300, False
 
     def __init__(self, points, poses, reach_px=15.0):
         self.points, self.poses, self.reach_px = points, poses, reach_px
@@ -248,8 +248,8 @@ class Line:
 
     def __init__(self, step, views):
         self.walk = Walk(step=step, views=views)
-        config = preset("mono")
-        self.config = replace(config, tracking=replace(config.tracking, association="descriptors"))
+        config = preset("mono-flow")
+        self.config = config
         eye = replace(Eye.of_camera(CAMERA), T_body_camera=T_BODY_CAMERA)
         self.map = self.walk.map
         self.keyframes = Keyframes(self.map, eye, None, NO_BIAS, self.walk.oracle, self.config)

@@ -91,12 +91,11 @@ def test_lost_frames_are_bridged(room, frames):
     honest(room, estimates)
 
 
-def test_a_camera_that_hangs_stands_still_and_is_caught_up_with(room):
+def test_a_camera_that_hangs_is_said_and_is_caught_up_with(room):
     estimates, _ = run(freeze(room, range(20, 23)))
-    assert lost(estimates) == []
-    for e in estimates[20:23]:
-        apart = se3_log(se3_inverse(estimates[19].T_world_body.matrix) @ e.T_world_body.matrix)
-        assert np.abs(apart).max() < 0.01
+    assert lost(estimates) == [20, 21, 22]
+    assert all("frozen" in e.reason for e in estimates[20:23])
+    assert estimates[23].status is Status.RECOVERED
     true = se3_inverse(room.truth.Ts_world_body[0]) @ room.truth.Ts_world_body
     off = [np.linalg.norm(e.T_world_body.t - true[e.frame_id, :3, 3]) for e in estimates]
     assert max(off[:20] + off[24:]) < 0.06
@@ -200,9 +199,9 @@ def test_without_a_left_image_a_frame_is_lost(room):
     assert estimates[9].status is Status.RECOVERED
 
 
-@pytest.mark.parametrize("name", ["stereo", "stereo-orb", "sgbm"])
+@pytest.mark.parametrize("name", ["stereo", "stereo-flow", "sgbm"])
 def test_swapped_images_are_said(room, name):
-    config = preset("stereo" if name == "sgbm" else name)
+    config = preset("stereo-flow" if name == "sgbm" else name)
     if name == "sgbm":
         config = replace(config, stereo=replace(config.stereo, method="sgbm"))
     source = edited(room.part(0, 8), lambda f: f.images[::-1])

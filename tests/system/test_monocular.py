@@ -311,7 +311,7 @@ def test_a_camera_that_rests_for_longer_than_the_window_keeps_its_scale(wall):
     there = walk(14)
     onwards = there[-1] @ walk(14)
     recording = wall.recording(np.concatenate([there, np.tile(there[-1:], (26, 1, 1)), onwards]))
-    config = preset("mono")
+    config = preset("mono-flow")
     config = replace(config, tracking=replace(config.tracking, keyframe_interval=2))
     estimates, result, _ = run(recording, config)
     assert Status.LOST not in {e.status for e in estimates}
@@ -343,11 +343,11 @@ def test_images_without_texture_wait(depth_room):
 
 
 def test_descriptors_track_a_single_camera_too(depth_room):
-    config = preset("mono")
+    config = preset("mono-flow")
     config = replace(
         config,
         features=replace(config.features, detector="sift", count=600),
-        tracking=replace(config.tracking, association="descriptors"),
+        tracking=replace(config.tracking, association="features"),
     )
     estimates, result, _ = run(depth_room.part(0, 26), config)
     assert first_tracked(estimates) <= 16
@@ -374,7 +374,7 @@ def test_the_mount_of_a_camera_is_told_and_truth_is_that_of_the_camera(depth_roo
     mount = SE3.exp([0.1, -0.05, 0.2, 0.3, -1.2, 0.4])
     rig = Rig(cameras=(replace(depth_room.rig.cameras[0], T_body_camera=mount),))
     assert preset_for(rig) == "mono"
-    vo = make_odometry(rig, preset("mono"))
+    vo = make_odometry(rig, preset("mono-flow"))
     for frame in depth_room.part(0, 24):
         vo.track(frame)
     result = vo.finish()
@@ -388,7 +388,7 @@ def test_the_mount_of_a_camera_is_told_and_truth_is_that_of_the_camera(depth_roo
 
 
 def test_a_configuration_without_candidates_is_none_for_a_single_camera(depth_room):
-    config = preset("mono")
+    config = preset("mono-flow")
     config = replace(config, candidates=replace(config.candidates, follow=False))
     with pytest.raises(ConfigError, match=r"candidates\.follow"):
         MonocularVO(depth_room.rig.cameras[0].camera, config)
@@ -396,7 +396,7 @@ def test_a_configuration_without_candidates_is_none_for_a_single_camera(depth_ro
 
 def test_a_rig_without_a_camera():
     with pytest.raises(CalibrationError, match="no camera"):
-        make_odometry(Rig(cameras=()), preset("mono"))
+        make_odometry(Rig(cameras=()), preset("mono-flow"))
 
 
 def test_the_window_bounds_what_is_kept(done):

@@ -107,7 +107,7 @@ def test_the_same_images_give_the_same_bytes(room, done):
 
 @pytest.mark.parametrize("detector", ["orb", "sift", "fast", "harris"])
 def test_descriptors_track_too(room, detector):
-    config = preset("stereo-orb")
+    config = preset("stereo")
     config = replace(config, features=replace(config.features, detector=detector, count=300))
     part = room.part(0, 24)
     estimates, result, _ = run(part, config)
@@ -122,7 +122,7 @@ def test_descriptors_track_too(room, detector):
 
 @pytest.mark.parametrize("detector", ["orb", "sift", "harris"])
 def test_flow_follows_any_corners(room, detector):
-    config = preset("stereo")
+    config = preset("stereo-flow")
     config = replace(config, features=replace(config.features, detector=detector))
     estimates, result, _ = run(room.part(0, 20), config)
     assert {e.status for e in estimates} == {Status.TRACKING}
@@ -130,7 +130,7 @@ def test_flow_follows_any_corners(room, detector):
 
 
 def test_dense_disparities_do_as_well(room):
-    config = preset("stereo")
+    config = preset("stereo-flow")
     config = replace(config, stereo=replace(config.stereo, method="sgbm"))
     estimates, result, _ = run(room.part(0, 30), config)
     assert {e.status for e in estimates} == {Status.TRACKING}
@@ -157,7 +157,7 @@ def test_observers_are_told(room):
 
 def test_motion_is_predicted(room):
     """Flow without a pyramid reaches two pixels: only the prediction brings it near enough."""
-    config = preset("stereo")
+    config = preset("stereo-flow")
     config = replace(config, flow=replace(config.flow, levels=1))
     estimates, result, _ = run(room, config)
     assert [e.status for e in estimates].count(Status.TRACKING) >= 46
@@ -186,7 +186,7 @@ def test_the_window_bounds_what_is_kept(done):
 
 
 def test_another_window_is_another_path_and_as_good(room, done):
-    config = preset("stereo")
+    config = preset("stereo-flow")
     config = replace(config, window=replace(config.window, size=3, fixed=1))
     _, result, _ = run(room, config)
     assert ate(result.trajectory, room.truth).rmse < 0.03
@@ -194,9 +194,9 @@ def test_another_window_is_another_path_and_as_good(room, done):
 
 
 def test_presets_and_rhythms_that_are_not_there(room):
-    assert set(PRESETS) >= {"stereo", "stereo-orb"}
-    with pytest.raises(ConfigError, match="did you mean 'stereo-orb'"):
-        preset("stereo-orbs")
+    assert set(PRESETS) >= {"stereo", "stereo-flow"}
+    with pytest.raises(ConfigError, match="did you mean 'stereo-flow'"):
+        preset("stereo-flows")
     with pytest.raises(ConfigError, match="rhythm"):
         StereoVO(room.rig, rhythm="inlin")
 

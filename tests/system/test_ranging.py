@@ -18,7 +18,7 @@ from odomap.vision.stereo import StereoConfig
 
 def looked_at(eye, frame, count=200):
     """Return the frame's view and corners in it."""
-    config = preset("stereo")
+    config = preset("stereo-flow")
     association = FlowAssociation(config.features, config.flow, eye.mask)
     view = association.view(frame.id, frame.stamp_ns, eye.image(frame))
     return view, association.extend(view, np.empty((0, 2)), count)[0]

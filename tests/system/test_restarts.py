@@ -82,7 +82,7 @@ def test_depth_of_another_size_is_a_matter_of_calibration(depth_room):
 
 
 def test_one_camera_must_follow_candidates(depth_room):
-    config = preset("stereo")
+    config = preset("stereo-flow")
     with pytest.raises(ConfigError, match=r"candidates\.follow"):
         MonocularVO(depth_room.rig.cameras[0].camera, config)
 
@@ -100,7 +100,7 @@ def test_a_restart_forgets_the_window_before(depth_room):
 
 
 def test_a_camera_that_stands_keeps_its_scale(room):
-    config = preset("mono")
+    config = preset("mono-flow")
     # Many keyframes at one place, as a longer standstill would leave.
     config = replace(config, tracking=replace(config.tracking, keyframe_interval=4))
     frames = list(room)[:40]

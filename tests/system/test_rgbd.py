@@ -101,7 +101,7 @@ def test_corners_without_depth_are_triangulated(depth_room):
     """Where depth ends at 2.5 m the rest of the room is of use all the same."""
     near = edited(depth_room, lambda f: np.where(f.depth > 2.5, 0, f.depth).astype(np.float32))
     _, followed, vo = run(near)
-    config = preset("rgbd")
+    config = preset("rgbd-flow")
     config = replace(config, candidates=replace(config.candidates, follow=False))
     _, without, vo_without = run(near, config)
     assert vo.map.num_landmarks > 1.1 * vo_without.map.num_landmarks
@@ -208,7 +208,7 @@ def test_the_body_need_not_be_the_camera(depth_room, done):
     camera = replace(depth_room.rig.cameras[0], name="colour", T_body_camera=mount)
     other = CameraMount("other", depth_room.rig.cameras[0].camera)
     rig = Rig(cameras=(other, camera), depth=DepthMount("colour"))
-    vo = make_odometry(rig, preset("rgbd"))
+    vo = make_odometry(rig, preset("rgbd-flow"))
     for frame in depth_room.part(0, 24):
         vo.track(replace(frame, images=(None, *frame.images)))
     result = vo.finish()

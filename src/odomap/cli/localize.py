@@ -44,7 +44,7 @@ class _WithMap:
         chosen_config(self.preset, self.config, self.overrides)  # names are checked first
         saved = SavedMap.load(self.map)
         source = open_source(self.data, self.rig)
-        preset = self.preset or saved.usual_preset(source.rig, is_mapping)
+        preset = self.preset or saved.usual_preset(source.rig)
         config = chosen_config(preset, self.config, self.overrides, source.rig)
         out = self.out or Path("runs") / f"{folder_name(source.name)}_{default}"
         command: dict[str, object] = {"data": self.data, "preset": preset}

@@ -43,6 +43,8 @@ class Run:
     rhythm: Literal["inline", "lockstep", "live"] = "lockstep"
     """How stages follow each other: inline, each in turn; lockstep, mapping beside tracking, and
     still the same bytes on every run; live, at the pace of the sensor, dropping late frames."""
+    odometry_only: bool = False
+    """Follow the path alone, by optical flow: what is behind is forgotten."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Stop after this many frames."""
     quiet: bool = False
@@ -59,13 +61,17 @@ class Run:
         """Track, write, and say where everything is."""
         from odomap.run import chosen_config
         from odomap.sources.open import open as open_source
+        from odomap.system.config import odometry_preset
         from odomap.views.liveserver import check_viewer
 
         if self.view:
             check_viewer()
         chosen_config(self.preset, self.config, self.overrides)  # names are checked first
         source = open_source(self.data, self.rig)
-        config = chosen_config(self.preset, self.config, self.overrides, source.rig)
+        preset = self.preset
+        if preset is None and self.odometry_only:
+            preset = odometry_preset(source.rig)
+        config = chosen_config(preset, self.config, self.overrides, source.rig)
         out = self.out or Path("runs") / folder_name(source.name)
         command: dict[str, object] = {"data": self.data}
         if self.preset:
@@ -74,7 +80,15 @@ class Run:
             command["rig"] = str(self.rig)
         with self._view() as view:
             code, _ = track(
-                source, out, config, command, self.max_frames, self.quiet, self.rhythm, view
+                source,
+                out,
+                config,
+                command,
+                self.max_frames,
+                self.quiet,
+                self.rhythm,
+                view,
+                odometry_only=self.odometry_only,
             )
             if view is not None and code != 130:
                 view.wait()
@@ -104,6 +118,7 @@ def track(
     view: "View | None" = None,
     map: "SavedMap | None" = None,
     is_mapping: bool = True,
+    odometry_only: bool = False,
 ) -> "tuple[int, RunResult]":
     """Run with progress, print the conclusion, and return the exit code with the result."""
     from odomap.run import Interrupted, run
@@ -122,6 +137,7 @@ def track(
                 view=view or False,
                 map=map,
                 is_mapping=is_mapping,
+                odometry_only=odometry_only,
             )
     except Interrupted as stop:
         result, code = stop.result, 130

@@ -2,28 +2,29 @@
 
 Two ways with one face. `FlowAssociation` aligns the patches around the reference's keypoints in
 the new image; it finds nearly all of them, to a twentieth of a pixel, as long as the view changes
-little. `DescriptorAssociation` detects features in every image and compares descriptors near the
+little. `FeatureAssociation` detects features in every image and compares descriptors near the
 expected places; it costs detection and description, and survives larger changes.
 
 Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Montiel, Tardós,
 "ORB-SLAM", T-RO 2015, section V.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.limits import Count, Fraction, Limits, NotNegative, check_limits
-from odomap.vision.features import Corners, FeatureConfig, detect
+from odomap.vision.features import Corners, FeatureConfig, describe, detect
 from odomap.vision.flow import FlowConfig, pyramid, track
 from odomap.vision.matching import MatchConfig, match_guided
 from odomap.vision.orb import OrbConfig, describe_at, extract
 
 __all__ = [
     "Association",
-    "DescriptorAssociation",
+    "FeatureAssociation",
     "FlowAssociation",
     "Reference",
     "TrackingConfig",
@@ -44,8 +45,10 @@ class TrackingConfig:
 
     sensors: Literal["mono", "stereo", "rgbd"] = "stereo"
     """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image."""
-    association: Literal["flow", "descriptors"] = "flow"
-    """flow: patches followed by optical flow; descriptors: features matched in every frame."""
+    association: Literal["features", "flow"] = "features"
+    """features: found in every frame and known by their descriptors; SLAM finds them on all levels
+    of a pyramid (`orb`), odometry with the detector of `features`. flow: patches followed from the
+    last keyframe by optical flow, for speed."""
     min_inliers: Annotated[int, Limits(least=4)] = 15
     """Observations that must agree with a pose for it to count as tracked."""
     keyframe_ratio: Fraction = 0.85
@@ -160,10 +163,14 @@ class Association(Protocol):
 
     Attributes:
         count: features wanted per keyframe.
+        follows: whether points are followed, rather than found again by what they look like.
     """
 
     @property
     def count(self) -> int: ...  # noqa: D102 (see the class)
+
+    @property
+    def follows(self) -> bool: ...  # noqa: D102
 
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
         """Make a rectified image ready."""
@@ -216,6 +223,7 @@ class FlowAssociation:
     flow: FlowConfig
     mask: NDArray[np.bool_]
     describes: bool = False
+    follows: ClassVar[bool] = True
 
     @property
     def count(self) -> int:
@@ -265,23 +273,51 @@ class FlowAssociation:
 
 
 @dataclass(frozen=True)
-class DescriptorAssociation:
-    """Finds features on all levels of a pyramid, and matches them; see the module."""
+class FeatureAssociation:
+    """Finds features and matches them; see the module.
 
-    orb: OrbConfig
+    Attributes:
+        features: finds and describes those of an image.
+        count: how many are wanted per keyframe.
+        matching: how descriptors are compared.
+        reach: how far they are looked for at least, as a part of the image's width.
+    """
+
+    features: Callable[[Image], tuple[Corners, NDArray[np.uint8]]]
+    count: int
     matching: MatchConfig
-    mask: NDArray[np.bool_]
+    reach: float = 0.0
+    follows: ClassVar[bool] = False
 
-    @property
-    def count(self) -> int:
-        """Features wanted per keyframe."""
-        return self.orb.count
+    @staticmethod
+    def of_detector(
+        config: FeatureConfig, matching: MatchConfig, mask: NDArray[np.bool_]
+    ) -> "FeatureAssociation":
+        """Return one that detects corners on one level, more than a keyframe needs."""
+
+        def features(image: Image) -> tuple[Corners, NDArray[np.uint8]]:
+            corners = detect(image, config, 2 * config.count, None, mask)
+            descriptors, kept = describe(image, corners, config.detector)
+            at = corners.keypoints[kept], corners.strength[kept], corners.level[kept]
+            return Corners(*at), descriptors
+
+        return FeatureAssociation(features, config.count, matching)
+
+    @staticmethod
+    def of_pyramid(
+        config: OrbConfig, matching: MatchConfig, mask: NDArray[np.bool_]
+    ) -> "FeatureAssociation":
+        """Return one that finds features on all levels of a pyramid."""
+
+        def features(image: Image) -> tuple[Corners, NDArray[np.uint8]]:
+            found = extract(image, config, mask)
+            return Corners(found.keypoints, found.strength, found.level), found.descriptors
+
+        return FeatureAssociation(features, config.count, matching, REACH)
 
     def view(self, frame_id: int, stamp_ns: int, image: Image) -> View:
         """Find and describe features."""
-        found = extract(image, self.orb, self.mask)
-        corners = Corners(found.keypoints, found.strength, found.level)
-        return View(frame_id, stamp_ns, (image,), corners, found.descriptors)
+        return View(frame_id, stamp_ns, (image,), *self.features(image))
 
     def find(
         self,
@@ -293,7 +329,7 @@ class DescriptorAssociation:
         warp: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Match the descriptors near the guesses."""
-        reach = max(self.matching.radius_px, REACH * view.image.shape[1])
+        reach = max(self.matching.radius_px, self.reach * view.image.shape[1])
         matches = match_guided(
             descriptors,
             guess,

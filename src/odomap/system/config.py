@@ -16,7 +16,7 @@ from odomap.errors import CalibrationError, ConfigError, nearest_name
 from odomap.sensors.rig import Rig
 from odomap.system.association import (
     Association,
-    DescriptorAssociation,
+    FeatureAssociation,
     FlowAssociation,
     TrackingConfig,
 )
@@ -37,7 +37,14 @@ from odomap.vision.matching import MatchConfig
 from odomap.vision.orb import OrbConfig
 from odomap.vision.stereo import StereoConfig
 
-__all__ = ["PRESETS", "Config", "make_association", "preset", "preset_for"]
+__all__ = [
+    "PRESETS",
+    "Config",
+    "make_association",
+    "odometry_preset",
+    "preset",
+    "preset_for",
+]
 
 
 @dataclass(frozen=True)
@@ -82,41 +89,45 @@ class Config:
     """When what is found beside the tracker reaches it."""
 
 
+def _stereo() -> Config:
+    return Config()
+
+
 def _mono() -> Config:
     return Config(
-        features=FeatureConfig(count=500),
         tracking=TrackingConfig(sensors="mono"),
-        candidates=CandidateConfig(follow=True),
         bundle=BundleConfig(iterations=8),
     )
 
 
 def _rgbd() -> Config:
     # Cameras with a depth image are held by hand, blur, and expose row after row: points are where
-    # the model of one instant says only to a pixel or so, and corners are faint.
+    # the model of one instant says only to a pixel or so, and depth is that of another instant.
     return Config(
-        features=FeatureConfig(threshold=8),
-        tracking=TrackingConfig(sensors="rgbd"),
-        candidates=CandidateConfig(follow=True),
-        noise=NoiseConfig(position_px=1.2),
+        tracking=TrackingConfig(sensors="rgbd", keyframe_ratio=0.93),
+        noise=NoiseConfig(feature_px=1.0),
+        depth=DepthConfig(noise=0.003),
     )
 
 
-def _stereo() -> Config:
-    return Config()
+def _stereo_flow() -> Config:
+    return Config(tracking=TrackingConfig(association="flow"))
 
 
-def _stereo_orb() -> Config:
-    return Config(tracking=TrackingConfig(association="descriptors"))
-
-
-def _mono_orb() -> Config:
-    return Config(tracking=TrackingConfig(sensors="mono", association="descriptors"))
-
-
-def _rgbd_orb() -> Config:
+def _mono_flow() -> Config:
     return Config(
-        tracking=TrackingConfig(sensors="rgbd", association="descriptors"),
+        features=FeatureConfig(count=500),
+        tracking=TrackingConfig(sensors="mono", association="flow"),
+        candidates=CandidateConfig(follow=True),
+        bundle=BundleConfig(iterations=8),
+    )
+
+
+def _rgbd_flow() -> Config:
+    return Config(
+        features=FeatureConfig(threshold=8),  # blurred corners are faint
+        tracking=TrackingConfig(sensors="rgbd", association="flow"),
+        candidates=CandidateConfig(follow=True),
         noise=NoiseConfig(position_px=1.2),
     )
 
@@ -124,14 +135,17 @@ def _rgbd_orb() -> Config:
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
     {
         "stereo": _stereo,
-        "stereo-orb": _stereo_orb,
         "mono": _mono,
         "rgbd": _rgbd,
-        "mono-orb": _mono_orb,
-        "rgbd-orb": _rgbd_orb,
+        "stereo-flow": _stereo_flow,
+        "mono-flow": _mono_flow,
+        "rgbd-flow": _rgbd_flow,
+        "stereo-orb": _stereo,
+        "mono-orb": _mono,
+        "rgbd-orb": _rgbd,
     }
 )
-"""Named configurations: stereo, mono and rgbd (optical flow), and stereo-orb (descriptors)."""
+"""Named configurations: stereo, mono and rgbd, and the same with optical flow, for speed."""
 
 
 def preset(name: str) -> Config:
@@ -164,16 +178,22 @@ def preset_for(rig: Rig) -> str:
     return "stereo" if len(rig.cameras) > 1 else "mono"
 
 
-def make_association(
-    config: Config, mask: NDArray[np.bool_], describes: bool = False
-) -> Association:
-    """Return the association that a configuration asks for.
+def odometry_preset(rig: Rig) -> str:
+    """Return the preset for odometry with what a rig carries: the same, with optical flow.
+
+    Raises:
+        CalibrationError: it has no camera.
+    """
+    return f"{preset_for(rig)}-flow"
+
+
+def make_association(config: Config, mask: NDArray[np.bool_]) -> Association:
+    """Return the association that a configuration asks for, to make a map with.
 
     Args:
         config: the configuration.
         mask: (H, W) where the image holds something.
-        describes: whether points followed by optical flow are described for the map.
     """
     if config.tracking.association == "flow":
-        return FlowAssociation(config.features, config.flow, mask, describes)
-    return DescriptorAssociation(config.orb, config.matching, mask)
+        return FlowAssociation(config.features, config.flow, mask, describes=True)
+    return FeatureAssociation.of_pyramid(config.orb, config.matching, mask)

@@ -81,7 +81,7 @@ class Keyframes:
         keep = config.window.size + config.window.fixed
         self._sights = (
             FirstSights(map, eye.camera, eye.T_body_camera, config.flow, keep)
-            if config.tracking.association == "flow"
+            if association.follows
             else None
         )
         self._follower = Follower(
@@ -203,7 +203,9 @@ class Keyframes:
         triangulated = followed.points_world @ T_body_world[:3, :3].T + T_body_world[:3, 3]
         points_body[:c] = np.where(ranged[:c, None], points_body[:c], triangulated)
         placed = np.flatnonzero(np.isfinite(points_body[:, 0]))
-        described = features.descriptors[n + placed] if features.descriptors.shape[1] else None
+        # A map knows landmarks by 32 bytes; odometry may do with other descriptors, or none.
+        binary = features.descriptors.shape[1] == 32
+        described = features.descriptors[n + placed] if binary else None
         new = self._map.add_landmarks(keyframe_id, points_body[placed], described)
         ids = np.concatenate([seen.landmark_ids, new])
         rows = np.concatenate([np.arange(n), n + placed])

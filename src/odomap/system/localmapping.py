@@ -77,7 +77,12 @@ class MappingConfig:
 
 @dataclass(frozen=True)
 class MappingSections:
-    """The sections of a configuration that local mapping reads."""
+    """The sections of a configuration that local mapping reads.
+
+    Attributes:
+        sigma_px: standard deviation of a keypoint's position on the finest level.
+        level_scale: size of a pyramid level relative to the one above.
+    """
 
     mapping: MappingConfig
     creating: CreateConfig
@@ -86,6 +91,7 @@ class MappingSections:
     matching: MatchConfig
     bundle: BundleConfig
     noise: NoiseConfig
+    sigma_px: float
     level_scale: float
 
 
@@ -197,7 +203,6 @@ class LocalMapper:
         return [k for k in near.tolist() if k not in known][: config.near]
 
     def _window(self, snapshot: Snapshot, keyframe_id: int) -> LocalWindow:
-        noise = self._sections.noise
         ids = snapshot.landmark_ids
         return LocalWindow(
             snapshot.keyframes,
@@ -211,7 +216,7 @@ class LocalMapper:
             snapshot.obs_keypoint,
             int(np.flatnonzero(snapshot.keyframe_ids == keyframe_id)[0]),
             self._camera,
-            noise.position_px,
+            self._sections.sigma_px,
             self._sections.level_scale,
             self._sigma,
             self._bias.value,

@@ -116,7 +116,7 @@ class MapTracker(Tracker[LocalMap]):
             (self._expected_often, self._map.count_expected),
             (self._seen_often, self._map.count_seen),
         ):
-            if counted:
+            if counted and self._is_mapping:
                 tell(np.concatenate(counted))
             counted.clear()
 

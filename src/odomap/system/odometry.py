@@ -14,11 +14,15 @@ Cost: flow of some 300 points per frame; detection, stereo and one bundle adjust
 Reference: Nistér, Naroditsky, Bergen, "Visual Odometry", CVPR 2004.
 """
 
+import numpy as np
+from numpy.typing import NDArray
+
 from odomap.errors import CalibrationError, ConfigError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.sensors.rig import Rig
-from odomap.system.config import Config, make_association, preset
+from odomap.system.association import Association, FeatureAssociation, FlowAssociation
+from odomap.system.config import Config, preset
 from odomap.system.keyframetracking import KeyframeTracker
 from odomap.system.keyframing import Keyframes
 from odomap.system.mapping import WindowMapper
@@ -40,7 +44,7 @@ class Odometry(VisualSystem):
 
     def _stages(self, sight: Sight, config: Config) -> Stages:
         eye, ranger = sight.eye, sight.ranger
-        association = make_association(config, eye.mask)
+        association = _association(config, eye.mask)
         bias = sight.depth_bias(config.noise)
         keyframes = Keyframes(self.map, eye, ranger, bias, association, config)
         start = make_start(self.map, eye, keyframes, association, config)
@@ -68,7 +72,7 @@ class StereoVO(Odometry):
 
     Args:
         rig: with two cameras.
-        config: sections for all parts; default the preset "stereo".
+        config: sections for all parts; default the preset "stereo-flow".
         rhythm: which thread runs what; see `rhythms`.
 
     Raises:
@@ -77,7 +81,7 @@ class StereoVO(Odometry):
     """
 
     def __init__(self, rig: Rig, config: Config | None = None, rhythm: str = "inline") -> None:
-        config = preset("stereo") if config is None else config
+        config = preset("stereo-flow") if config is None else config
         super().__init__(Sight.of_pair(rig, config), config, rhythm)
 
 
@@ -89,7 +93,7 @@ class MonocularVO(Odometry):
 
     Args:
         camera: its lens; the first image of a frame is looked at.
-        config: sections for all parts; default the preset "mono".
+        config: sections for all parts; default the preset "mono-flow".
         rhythm: which thread runs what; see `rhythms`.
         T_body_camera: its mount on a rig, which a result tells; poses are the camera's anyway.
 
@@ -104,11 +108,11 @@ class MonocularVO(Odometry):
         rhythm: str = "inline",
         T_body_camera: SE3 | None = None,
     ) -> None:
-        config = preset("mono") if config is None else config
+        config = preset("mono-flow") if config is None else config
         if not config.candidates.follow:
             raise ConfigError(
                 "candidates.follow: false, but a single camera gets its landmarks that way alone: "
-                "set it true, or take the preset mono"
+                "set it true, or take the preset mono-flow"
             )
         super().__init__(Sight.of_camera(camera, T_body_camera), config, rhythm)
 
@@ -118,7 +122,7 @@ class RgbdVO(Odometry):
 
     Args:
         rig: with a camera and a depth image.
-        config: sections for all parts; default the preset "rgbd".
+        config: sections for all parts; default the preset "rgbd-flow".
         rhythm: which thread runs what; see `rhythms`.
 
     Raises:
@@ -127,7 +131,7 @@ class RgbdVO(Odometry):
     """
 
     def __init__(self, rig: Rig, config: Config | None = None, rhythm: str = "inline") -> None:
-        config = preset("rgbd") if config is None else config
+        config = preset("rgbd-flow") if config is None else config
         super().__init__(Sight.of_depth(rig, config), config, rhythm)
 
 
@@ -150,3 +154,10 @@ def make_odometry(rig: Rig, config: Config, rhythm: str = "inline") -> Odometry:
         raise CalibrationError("this rig has no camera: monocular odometry needs one")
     mount = rig.cameras[0]
     return MonocularVO(mount.camera, config, rhythm, mount.T_body_camera)
+
+
+def _association(config: Config, mask: NDArray[np.bool_]) -> Association:
+    """Return how points are found again; odometry keeps no map that they would be described for."""
+    if config.tracking.association == "flow":
+        return FlowAssociation(config.features, config.flow, mask)
+    return FeatureAssociation.of_detector(config.features, config.matching, mask)

@@ -15,6 +15,7 @@ T-RO 2015; Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from odomap.errors import ConfigError
 from odomap.maps.map import Map
@@ -71,9 +72,11 @@ class Slam(VisualSystem):
         if follows and not self._is_mapping:
             raise ConfigError(
                 "tracking.association: optical flow follows keyframes, and none are made where the "
-                "map is not to change: use 'descriptors'"
+                "map is not to change: use 'features'"
             )
-        association = make_association(config, eye.mask, describes=True)
+        if not follows:  # features are matched where the mapper looks for them, not followed
+            config = replace(config, candidates=replace(config.candidates, follow=False))
+        association = make_association(config, eye.mask)
         bias = sight.depth_bias(config.noise)
         keyframes = Keyframes(self.map, eye, ranger, bias, association, config)
         start = make_start(self.map, eye, keyframes, association, config)
@@ -108,6 +111,7 @@ class Slam(VisualSystem):
 
 
 def _sections(config: Config) -> MappingSections:
+    noise = config.noise
     return MappingSections(
         config.mapping,
         config.creating,
@@ -115,6 +119,7 @@ def _sections(config: Config) -> MappingSections:
         config.culling,
         config.matching,
         config.bundle,
-        config.noise,
+        noise,
+        noise.position_px if config.tracking.association == "flow" else noise.feature_px,
         config.orb.scale,
     )

@@ -161,7 +161,7 @@ class TwoViewsStart:
         self._corners: FollowedCorners | None = None
         self._between: list[_Between] = []
         self._needed_px = config.bootstrap.min_parallax_px
-        follows = config.tracking.association == "flow"
+        follows = association.follows
         self._share = LEAST_FOLLOWED if follows else LEAST_MATCHED
         self._patience = 0 if follows else MATCH_PATIENCE
 

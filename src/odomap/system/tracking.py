@@ -61,6 +61,9 @@ class Known(Protocol):
 
 K = TypeVar("K", bound=Known)
 
+BLANK = 8.0
+"""Standard deviation of grey levels below which an image shows nothing."""
+
 
 class Clock:
     """Milliseconds per stage; for people, nothing decides by it."""
@@ -105,6 +108,7 @@ class Tracker(ABC, Generic[K]):
         self._map, self._eye, self._association = map, eye, association
         self._start, self._tracking = start, config
         self._last: View | None = None
+        self._raw: NDArray[np.uint8] | None = None
         self._newest_ns = -1
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = 0
@@ -150,6 +154,8 @@ class Tracker(ABC, Generic[K]):
         image = self._eye.image(frame)
         if image is None:
             return self._lose(frame, f"the {self._eye.name} image is missing", clock)
+        if self._is_frozen(frame):
+            return self._lose(frame, "the image is the one before, bit by bit: frozen?", clock)
         look = Look(frame, self._association.view(frame.id, frame.stamp_ns, image), clock)
         clock.lap("prepare")
         known = self._known()
@@ -166,6 +172,16 @@ class Tracker(ABC, Generic[K]):
     def _may_start_anew(self) -> bool:
         """Say whether one that is lost for long may begin again."""
         return True
+
+    def _is_frozen(self, frame: Frame) -> bool:
+        """Say whether a frame shows the very same image as the one before, though it is no blank.
+
+        Even of a camera that stands still no two images are equal: there is noise.
+        """
+        before, self._raw = self._raw, frame.images[self._eye.index]
+        if before is None or self._raw is None or not len(self.path):
+            return False
+        return np.array_equal(before, self._raw) and float(before.std()) > BLANK
 
     # ---- the three ways a frame can go ----
 
@@ -329,7 +345,7 @@ class Tracker(ABC, Generic[K]):
 def _why_lost(located: Located, needed: int, view: View) -> str:
     """Say in a sentence why too few observations agree."""
     contrast = float(view.pyramid[-1].std())
-    if contrast < 8.0:
+    if contrast < BLANK:
         cause = (
             f"the image is nearly uniform (contrast {contrast:.0f} of 255): covered lens, no light?"
         )

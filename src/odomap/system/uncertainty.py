@@ -47,7 +47,9 @@ class NoiseConfig:
     """How far what is measured may be off."""
 
     position_px: Positive = 0.4
-    """Standard deviation of a tracked point's position."""
+    """Standard deviation of the position of a point followed by optical flow."""
+    feature_px: Positive = 0.7
+    """Standard deviation of the position of a feature found on the finest level of the pyramid."""
     overlap: Positive = 4.0
     """Factor on variances for errors that observations share: patches overlap, tracks go on."""
     calibration_px: NotNegative = 0.15
