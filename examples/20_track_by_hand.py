@@ -6,11 +6,10 @@ Run it with `python examples/20_track_by_hand.py`; docs/lesson/03_orb_slam.md ex
 import numpy as np
 
 from odomap import SE3, Camera, Slam, open
-from odomap.maps.views import LandmarkViews
 from odomap.vision.orb import OrbConfig, OrbFeatures, extract
 
 
-def search(views: LandmarkViews, T: SE3, camera: Camera, found: OrbFeatures, radius: float):
+def search(views, T: SE3, camera: Camera, found: OrbFeatures, radius: float) -> np.ndarray:
     """Return (n, 2): which map point is which feature, if the camera is at T_world_camera."""
     pairs, p = [], T.inverse() @ views.points_world
     away, pixels = np.linalg.norm(p, axis=1), camera.project(p)
@@ -53,8 +52,7 @@ def main() -> None:
     poses.append(("odomap", (estimate := system.track(last)).T_world_body, estimate.num_inliers))
     true = source.truth.pose(0).inverse() @ source.truth.pose(len(before))
     for name, T, count in poses:
-        off = 1000 * np.linalg.norm(T.t - true.t)
-        print(f"{name:21}: {count:3} map points, off by {off:5.1f} mm")
+        print(f"{name:21}: {count:3} points, off by {1000 * np.linalg.norm(T.t - true.t):5.1f} mm")
 
 
 if __name__ == "__main__":
