@@ -122,16 +122,11 @@ class Sightings(Skeleton):
                 sees several that are joined, the survivor's observation stays, else the oldest's.
         """
         with self.lock:
-            winners = self._landmarks.slots(self._ids(survivors)).tolist()
-            losers = self._landmarks.slots(self._ids(gone)).tolist()
-            heir: dict[int, int] = {}
-            for winner, loser in zip(winners, losers, strict=True):
-                winner, loser = _root(heir, winner), _root(heir, loser)
-                if winner >= 0 and loser >= 0 and winner != loser:
-                    heir[loser] = winner
-            lost = np.asarray(list(heir), np.int64)
-            lost = lost[np.argsort(self._landmarks.ids[lost])]
-            kept = np.asarray([_root(heir, slot) for slot in lost.tolist()], np.int64)
+            winners = self._landmarks.slots(self._ids(survivors))
+            losers = self._landmarks.slots(self._ids(gone))
+            lost, kept = _heirs(winners, losers)
+            order = np.argsort(self._landmarks.ids[lost])
+            lost, kept = lost[order], kept[order]
             self._observations.reassign(lost, kept)
             self._landmarks.forward(lost, kept)
             self.version += 1
@@ -263,6 +258,31 @@ class Sightings(Skeleton):
     def _points(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
         anchors = self._landmarks.anchor.take(slots).astype(np.int64)
         return act(self.states.placements(anchors), self._landmarks.p_anchor.take(slots))
+
+
+def _heirs(
+    winners: NDArray[np.int64], losers: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return (F,) slots that are lost, and where each chain of N pairs (-1: dead) ends, in order.
+
+    Raises:
+        ValueError: there are not as many of ones as of the others.
+    """
+    if len(winners) != len(losers):
+        raise ValueError(f"{len(winners)} survivors but {len(losers)} gone")
+    good = (winners >= 0) & (losers >= 0)
+    winners, losers = winners[good], losers[good]
+    is_lost = np.zeros(int(max(winners.max(initial=-1), losers.max(initial=-1))) + 1, np.bool_)
+    is_lost[losers] = True
+    if np.count_nonzero(is_lost) == len(losers) and not is_lost[winners].any():
+        return losers, winners  # no chains
+    heir: dict[int, int] = {}
+    for winner, loser in zip(winners.tolist(), losers.tolist(), strict=True):
+        winner, loser = _root(heir, winner), _root(heir, loser)
+        if winner != loser:
+            heir[loser] = winner
+    lost = np.asarray(list(heir), np.int64)
+    return lost, np.asarray([_root(heir, slot) for slot in lost.tolist()], np.int64)
 
 
 def _root(heir: dict[int, int], slot: int) -> int:

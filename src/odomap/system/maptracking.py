@@ -74,6 +74,7 @@ class MapTracker(Tracker[LocalMap]):
         self._is_given = map.num_keyframes > 0
         self._local: LocalMap | None = None
         self._epoch = map.epoch
+        self._due: tuple[int, Array] | None = None
         self._shown = np.empty(0, np.int64)
         self._expected_often: list[Index] = []
         self._seen_often: list[Index] = []
@@ -81,21 +82,33 @@ class MapTracker(Tracker[LocalMap]):
     # ---- the local map ----
 
     def _begun(self, started: Started) -> None:
-        self._turn_to(
-            started.reference.keyframe_id, self._map.T_world_body(started.reference.keyframe_id)
-        )
+        keyframe_id = started.reference.keyframe_id
+        self._turn_later(keyframe_id, self._map.T_world_body(keyframe_id))
         self._shown = started.reference.landmark_ids
 
     def _known(self) -> LocalMap | None:
         """Return the local map, read again where the mapper has changed the map."""
-        if self._local is not None and self._epoch != self._map.epoch:
-            self._turn_to(self._local.keyframe_id, self.path.last_pose())
-            self._shown = self._map.resolve(self._shown)
+        due, is_changed = self._due, self._epoch != self._map.epoch
+        if due is None and self._local is not None and is_changed:
+            due = self._local.keyframe_id, self.path.last_pose()
+        if due is not None:
+            self._turn_to(due[0], self.path.last_pose() if is_changed else due[1])
+            if is_changed:
+                self._shown = self._map.resolve(self._shown)
         return self._local
+
+    def _turn_later(self, keyframe_id: int, T_world_body: Array) -> None:
+        """Take the surroundings of a keyframe as the local map when it is asked for.
+
+        A new keyframe is no sooner there than the mapper changes what is around it.
+        """
+        self._count()
+        self._due, self._epoch = (keyframe_id, T_world_body), self._map.epoch
 
     def _turn_to(self, keyframe_id: int, T_world_body: Array) -> None:
         """Take the surroundings of a keyframe as the local map."""
         self._count()
+        self._due = None
         alive = keyframe_id
         if not self._map.is_keyframe_alive(keyframe_id):
             alive = self._map.parent(keyframe_id)
@@ -173,7 +186,7 @@ class MapTracker(Tracker[LocalMap]):
             self._seen_often.append(shown)
             nearest = int(self._map.observing(shown)[0][0])
             if nearest != known.keyframe_id:
-                self._turn_to(nearest, located.T_world_body)
+                self._turn_later(nearest, located.T_world_body)
         return estimate
 
     # ---- keyframes ----
@@ -199,7 +212,7 @@ class MapTracker(Tracker[LocalMap]):
         seen = self._keyframes.measure_found(look.frame, look.view, T_world_body, ids, pixels)
         covariance = self.path.covariance(placed)
         made = self._keyframes.add(look.view, T_world_body, seen, known.keyframe_id, covariance)
-        self._turn_to(made.keyframe_id, T_world_body)
+        self._turn_later(made.keyframe_id, T_world_body)
         self._shown = made.landmark_ids
         return made.keyframe_id
 
