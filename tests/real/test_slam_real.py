@@ -24,10 +24,10 @@ class Bar:
 
 
 BARS = (
-    Bar("euroc_mh01", "stereo-orb", 110, 0.0045),
-    Bar("kitti_stereo", "stereo-orb", 51, 0.056),
-    Bar("kitti_mono", "mono-orb", 100, 0.11, 10),
-    Bar("rgbd_desk", "rgbd-orb", 160, 0.03),
+    Bar("euroc_mh01", "stereo", 110, 0.0045),
+    Bar("kitti_stereo", "stereo", 51, 0.056),
+    Bar("kitti_mono", "mono", 100, 0.11, 10),
+    Bar("rgbd_desk", "rgbd", 160, 0.03),
 )
 
 

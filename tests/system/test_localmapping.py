@@ -43,17 +43,6 @@ def is_sound(m):
     assert np.isfinite(m.Ts_world_body(m.keyframe_ids)).all()
 
 
-def num_doubled(m):
-    """Count the keypoints that are two landmarks at once."""
-    rows = [m.observations_of(k)[1] for k in m.keyframe_ids.tolist()]
-    return sum(len(r) - len(np.unique(r)) for r in rows)
-
-
-def num_unseen(m):
-    """Count the landmarks that no keyframe sees."""
-    return int(np.sum(m.count_observers(m.landmark_ids) == 0))
-
-
 # ---- windows of known truth ----
 
 
@@ -80,9 +69,7 @@ def as_map(window, off=0.0, seed=0):
 
 def mapper_of(m, config=None, has_depth=False, **how):
     config = Config() if config is None else config
-    sections = replace(_sections(config), level_scale=1.2)
-    if hasattr(sections, "sigma_px"):
-        sections = replace(sections, sigma_px=0.5)
+    sections = replace(_sections(config), sigma_px=0.5, level_scale=1.2)
     return LocalMapper(
         m,
         CAMERA,
@@ -265,11 +252,7 @@ def rounds():
 
 def tracker(sensors, how):
     """Return the preset for sensors with features or flow."""
-    config = preset(f"{sensors}-orb")
-    if how == "features":
-        return config
-    config = preset(sensors)
-    return replace(config, tracking=replace(config.tracking, association="flow"))
+    return preset(sensors if how == "features" else f"{sensors}-flow")
 
 
 def run(source, config, rhythm="inline", after=lambda slam, estimate: None):

@@ -49,7 +49,7 @@ def pose_error(estimate, truth, index):
 
 def test_a_second_round_hangs_from_the_first(loop):
     """What was mapped is found again: most frames of the second round need no new keyframe."""
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, loop)
     assert {e.status for e in estimates} <= {Status.TRACKING, Status.RECOVERED}
     made = [e.keyframe_id for e in estimates[:PER_ROUND] if e.is_keyframe]
@@ -63,7 +63,7 @@ def test_a_second_round_hangs_from_the_first(loop):
 
 
 def test_frames_hang_from_keyframes_that_came_before(loop):
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, loop.part(0, PER_ROUND))
     m = slam.map
     for n, e in enumerate(estimates):
@@ -76,13 +76,13 @@ def test_frames_hang_from_keyframes_that_came_before(loop):
 
 
 def test_keyframes_are_made_where_something_new_is_seen(loop):
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, loop.part(0, PER_ROUND))
     inliers = np.array([e.num_inliers for e in estimates])
     chosen = [n for n, e in enumerate(estimates) if e.is_keyframe]
     assert chosen[0] == 0
     assert 3 <= len(chosen) <= PER_ROUND // 2
-    config = preset("stereo-orb").tracking
+    config = preset("stereo").tracking
     for before, n in pairwise(chosen):
         fell = inliers[n] < config.keyframe_ratio * inliers[before + 1]
         assert fell or n - before >= config.keyframe_interval
@@ -92,7 +92,7 @@ def test_keyframes_are_made_where_something_new_is_seen(loop):
 
 
 def test_the_map_is_told_what_was_found(loop):
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     track(slam, loop.part(0, PER_ROUND))
     m = slam.map
     ids = m.landmark_ids
@@ -107,7 +107,7 @@ def test_a_camera_that_jumps_back_is_found_again(loop):
     frames = list(loop)
     there, back = frames[:14], frames[PER_ROUND + 2 : PER_ROUND + 6]
     covered = [blank(f) for f in frames[14:17]]
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, in_order([*there, *covered, *back]))
     statuses = [e.status for e in estimates]
     assert statuses[:14] == [Status.TRACKING] * 14
@@ -126,10 +126,10 @@ def test_one_that_is_lost_for_long_starts_anew_where_nothing_is_known(loop):
     turned[0, 0] = turned[2, 2] = -1.0
     elsewhere = list(walk(np.stack([turned] * 12), seed=RIG_SEED))
     frames = list(loop)[:8]
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, in_order([*frames, *elsewhere]))
     statuses = [e.status for e in estimates]
-    patience = preset("stereo-orb").tracking.patience
+    patience = preset("stereo").tracking.patience
     assert statuses[:8] == [Status.TRACKING] * 8
     assert set(statuses[8 : 8 + patience]) == {Status.LOST}
     begun = statuses.index(Status.INITIALIZING)
@@ -143,13 +143,13 @@ def test_one_that_is_lost_for_long_starts_anew_where_nothing_is_known(loop):
 @pytest.fixture(scope="module")
 def mapped(loop):
     """Return a map of the loop's first round."""
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     track(slam, loop.part(0, PER_ROUND))
     return slam.map
 
 
 def localizer(loop, tables):
-    return Slam(loop.rig, preset("stereo-orb"), map=Map.restored(tables), is_mapping=False)
+    return Slam(loop.rig, preset("stereo"), map=Map.restored(tables), is_mapping=False)
 
 
 def test_a_map_is_not_changed_by_being_used(loop, mapped):
@@ -186,7 +186,7 @@ def test_one_that_only_looks_never_starts_anew(loop, mapped):
 def test_what_is_in_no_map_is_not_placed(loop, mapped):
     """Another room: no pose is better than a wrong one."""
     other = walk(small_loop(6), seed=11)
-    slam = Slam(other.rig, preset("stereo-orb"), map=Map.restored(mapped.dump()), is_mapping=False)
+    slam = Slam(other.rig, preset("stereo"), map=Map.restored(mapped.dump()), is_mapping=False)
     estimates = track(slam, other)
     assert not {Status.TRACKING, Status.RECOVERED} & {e.status for e in estimates}
     assert all(e.reason for e in estimates)
@@ -194,7 +194,7 @@ def test_what_is_in_no_map_is_not_placed(loop, mapped):
 
 def test_a_frame_without_its_image_or_out_of_order_is_lost_and_forgotten(loop):
     frames = list(loop)[:8]
-    slam = Slam(loop.rig, preset("stereo-orb"))
+    slam = Slam(loop.rig, preset("stereo"))
     track(slam, frames[:5])
     missing = slam.track(Frame(5, frames[5].stamp_ns, (None, None)))
     late = slam.track(replace(frames[3], id=6))

@@ -15,9 +15,9 @@ from odomap.system.config import preset
 from odomap.system.slam import Slam
 from system.conftest import recorded
 
-METRIC = ("stereo", "stereo-orb", "rgbd", "rgbd-orb")
-SINGLE = ("mono", "mono-orb")
-ORB = ("stereo-orb", "rgbd-orb", "mono-orb")
+METRIC = ("stereo", "stereo-flow", "rgbd", "rgbd-flow")
+SINGLE = ("mono", "mono-flow")
+FEATURES = ("stereo", "rgbd", "mono")
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_estimates_hold_together(world, runs, name):
     assert np.isin(result.keyframes.stamps_ns, stamps).all()
 
 
-@pytest.mark.parametrize("name", ORB)
+@pytest.mark.parametrize("name", FEATURES)
 def test_frames_hang_from_keyframes_that_were_there(runs, name):
     """A frame may hang from an old keyframe; it may well be culled later, and is placed still."""
     estimates, result, _ = runs(name)
@@ -175,7 +175,7 @@ def test_the_map_lies_on_the_walls(world, runs, name):
     assert np.percentile(np.abs(ratio - 1.0), 75) < 0.08
 
 
-@pytest.mark.parametrize("name", ["stereo-orb", "mono"])
+@pytest.mark.parametrize("name", ["stereo", "mono-flow"])
 def test_the_same_images_give_the_same_bytes(world, runs, name):
     _, result, _ = runs(name)
     _, again, _ = run(world, name)
@@ -193,27 +193,27 @@ def test_the_preset_is_that_of_the_rig(world):
     with pytest.raises(CalibrationError, match="no camera"):
         Slam(Rig())
     with pytest.raises(CalibrationError, match="depth"):
-        Slam(mono, preset("rgbd-orb"))
+        Slam(mono, preset("rgbd"))
     with pytest.raises(CalibrationError):
-        Slam(mono, preset("stereo-orb"))
+        Slam(mono, preset("stereo"))
     with pytest.raises(ConfigError, match="rhythm"):
         Slam(world.rig, rhythm="waltz")
 
 
 def test_a_path_before_the_first_frame_is_empty(world):
-    result = Slam(world.rig, preset("stereo-orb")).finish()
+    result = Slam(world.rig, preset("stereo")).finish()
     assert len(result.trajectory) == len(result.keyframes) == 0
     assert result.map.num_keyframes == 0
 
 
 def test_a_map_can_be_gone_on_with_or_only_used(world, runs):
     """The same frames in a map of them: all are placed, and without mapping nothing is written."""
-    _, before, slam = runs("stereo-orb")
+    _, before, slam = runs("stereo")
     tables = slam.map.dump()
     keyframes, landmarks = slam.map.num_keyframes, slam.map.num_landmarks
     localizer = Slam(
         world.rig,
-        preset("stereo-orb"),
+        preset("stereo"),
         map=type(slam.map).restored(tables),
         is_mapping=False,
     )
