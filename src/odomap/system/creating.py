@@ -151,8 +151,10 @@ def _is_aside(
     if min_baseline is not None:
         return baseline >= min_baseline
     seen = window.points_world[window.obs_landmark[window.obs_keyframe == k]]
-    depth = np.median((seen - window.center(k)) @ window.Ts_world_camera[k, :3, 2])
-    return baseline >= config.min_baseline * float(depth)
+    depth = (seen - window.center(k)) @ window.Ts_world_camera[k, :3, 2]
+    middle = (len(depth) - 1) // 2, len(depth) // 2
+    median = np.partition(depth, middle)[list(middle)].mean()
+    return baseline >= config.min_baseline * float(median)
 
 
 def _match(window: LocalWindow, neighbours: list[int], matching: MatchConfig) -> _Pairs:
@@ -160,11 +162,15 @@ def _match(window: LocalWindow, neighbours: list[int], matching: MatchConfig) ->
     n = window.newest
     # The line is as uncertain as the keypoint it comes from.
     sigma = np.sqrt(2.0) * window.sigma_px / window.camera.fx
-    first, rows = _free(window, n), [np.empty((0, 3), np.int64)]
+    usable = np.ones(window.first[-1], np.bool_)
+    usable[window.first[window.obs_keyframe] + window.obs_keypoint] = False
+    first, rows = _free(window, n, usable), [np.empty((0, 3), np.int64)]
     T_newest_world = se3_inverse(window.Ts_world_camera[n])
     for k in neighbours:
         T = np.ascontiguousarray(se3_inverse(T_newest_world @ window.Ts_world_camera[k]))
-        found = match_epipolar(first, _free(window, k), T, sigma, window.level_scale, matching)
+        found = match_epipolar(
+            first, _free(window, k, usable), T, sigma, window.level_scale, matching
+        )
         rows.append(np.stack([found[:, 0], np.full(len(found), k), found[:, 1]], axis=1))
     all_rows = np.concatenate(rows)
     order = np.argsort(all_rows[:, 0], kind="stable")
@@ -172,11 +178,10 @@ def _match(window: LocalWindow, neighbours: list[int], matching: MatchConfig) ->
     return _Pairs(keypoint, neighbour, other)
 
 
-def _free(window: LocalWindow, k: int) -> EpipolarView:
-    """Return the keypoints of keyframe k that have no landmark, for matching."""
-    features = window.features(k)
-    usable = window.landmark_at(k) < 0
-    return EpipolarView(features.descriptors, features.bearings, features.level, usable)
+def _free(window: LocalWindow, k: int, usable: NDArray[np.bool_]) -> EpipolarView:
+    """Return keyframe k for matching, where some of all keypoints (n,) are usable."""
+    features, rows = window.features(k), slice(window.first[k], window.first[k + 1])
+    return EpipolarView(features.descriptors, features.bearings, features.level, usable[rows])
 
 
 def _views(window: LocalWindow) -> Array:
@@ -187,14 +192,11 @@ def _views(window: LocalWindow) -> Array:
 
 def _sightings(window: LocalWindow, keyframe: Index, keypoint: Index) -> Array:
     """Return (P, 4) of keypoints: x/z, y/z, inverse depth (NaN: unknown), size of the level."""
-    seen = np.empty((len(keyframe), 4))
-    for k in np.flatnonzero(np.bincount(keyframe)).tolist():
-        features, at = window.features(k), np.flatnonzero(keyframe == k)
-        rows = keypoint[at]
-        bearings = features.bearings[rows]
-        seen[at, :2] = bearings[:, :2] / bearings[:, 2:]
-        seen[at, 2] = 1.0 / features.depth[rows]
-        seen[at, 3] = window.level_scale ** features.level[rows].astype(np.float64)
+    at = window.first[keyframe] + keypoint
+    bearings, seen = window.bearings[at], np.empty((len(keyframe), 4))
+    seen[:, :2] = bearings[:, :2] / bearings[:, 2:]
+    seen[:, 2] = 1.0 / window.depths[at]
+    seen[:, 3] = window.level_scale ** window.levels[at].astype(np.float64)
     return seen
 
 

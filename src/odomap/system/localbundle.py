@@ -119,16 +119,11 @@ def _measured(
     window: LocalWindow, keyframe: NDArray[np.int64], keypoint: NDArray[np.int64]
 ) -> tuple[Array, Array, Array]:
     """Return what keyframes measured: xy (N, 2), inverse depth (N,), weights (N, 2)."""
-    xy, inverse_depth = np.empty((len(keyframe), 2)), np.empty(len(keyframe))
-    level = np.empty(len(keyframe))
-    for k in np.unique(keyframe).tolist():
-        rows = np.flatnonzero(keyframe == k)
-        features, seen = window.features(k), keypoint[rows]
-        bearings = features.bearings[seen]
-        xy[rows] = bearings[:, :2] / bearings[:, 2:]
-        bias = bias_at(window.inverse_depth_bias, bearings)
-        inverse_depth[rows] = 1.0 / features.depth[seen] - bias
-        level[rows] = features.level[seen]
+    at = window.first[keyframe] + keypoint
+    bearings = window.bearings[at]
+    xy = bearings[:, :2] / bearings[:, 2:]
+    inverse_depth = 1.0 / window.depths[at] - bias_at(window.inverse_depth_bias, bearings)
+    level = window.levels[at].astype(np.float64)
     sigma = window.sigma_px / window.camera.fx * window.level_scale**level
     depth = np.full(len(keyframe), window.inverse_depth_sigma)
     return xy, inverse_depth, 1.0 / np.stack([sigma, depth], axis=1)

@@ -10,6 +10,7 @@ T-RO 2015, section VI.
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,26 @@ class LocalWindow:
         features = self.keyframes[k].features
         assert features is not None, "a window is made of keyframes with features"
         return features
+
+    @cached_property
+    def first(self) -> Index:
+        """(K + 1,) where the keypoints of each keyframe begin when all are put in a row."""
+        return np.cumsum([0, *(len(self.features(k)) for k in range(len(self.keyframes)))])
+
+    @cached_property
+    def bearings(self) -> Array:
+        """(n, 3) of all keypoints, keyframe by keyframe."""
+        return np.concatenate([self.features(k).bearings for k in range(len(self.keyframes))])
+
+    @cached_property
+    def depths(self) -> Array:
+        """(n,) of all keypoints, keyframe by keyframe; NaN where unknown."""
+        return np.concatenate([self.features(k).depth for k in range(len(self.keyframes))])
+
+    @cached_property
+    def levels(self) -> NDArray[np.uint8]:
+        """(n,) of all keypoints, keyframe by keyframe."""
+        return np.concatenate([self.features(k).level for k in range(len(self.keyframes))])
 
     def landmark_at(self, k: int) -> Index:
         """Return the landmark row at each keypoint of keyframe row k, (n,), −1 for none."""

@@ -27,6 +27,7 @@ __all__ = [
     "popcount",
     "search_all",
     "search_circles",
+    "search_epipolar",
     "search_lines",
     "warm_up",
 ]
@@ -205,6 +206,82 @@ def search_lines(
     for i in range(len(first)):
         if matches[i] >= 0 and owner[matches[i]] != i:
             matches[i] = -1
+
+
+@kernel
+def _epipolar_lines(
+    bearings: NDArray[np.float64], rows: Index, T: NDArray[np.float64], lines: NDArray[np.float32]
+) -> None:
+    """lines[i] = t x (R b_i), of some bearings."""
+    for i in range(len(rows)):
+        b = bearings[rows[i]]
+        x = T[0, 0] * b[0] + T[0, 1] * b[1] + T[0, 2] * b[2]
+        y = T[1, 0] * b[0] + T[1, 1] * b[1] + T[1, 2] * b[2]
+        z = T[2, 0] * b[0] + T[2, 1] * b[1] + T[2, 2] * b[2]
+        lines[i, 0] = T[1, 3] * z - T[2, 3] * y
+        lines[i, 1] = T[2, 3] * x - T[0, 3] * z
+        lines[i, 2] = T[0, 3] * y - T[1, 3] * x
+
+
+@kernel
+def _rows_of(words: Words, rows: Index, chosen: Words) -> None:
+    """chosen[i] = words[rows[i]]."""
+    for i in range(len(rows)):
+        for k in range(4):
+            chosen[i, k] = words[rows[i], k]
+
+
+@kernel
+def search_epipolar(
+    first: Words,
+    bearings: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    second: Words,
+    others: NDArray[np.float64],
+    levels: NDArray[np.uint8],
+    free: NDArray[np.bool_],
+    T: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    gates: NDArray[np.float64],
+    ratio: float,
+    limit: int,
+    pairs: Index,
+) -> int:
+    """`search_lines` between the usable features of two views; return how many pairs there are.
+
+    T leads from the first camera to the second, variance is that of each level on the plane z = 1,
+    gates are that of χ² and how many deviations the epipole is kept away from.
+    """
+    rows, there = np.flatnonzero(usable), np.flatnonzero(free)
+    n = len(there)
+    plane, limits, size = (
+        np.empty((2, n), np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.uint8),
+    )
+    ex, ey = T[0, 3] / T[2, 3], T[1, 3] / T[2, 3]
+    for j in range(n):
+        b = others[there[j]]
+        size[j] = levels[there[j]]
+        spread = variance[size[j]]
+        x, y = b[0] / b[2], b[1] / b[2]
+        # Of a sideways motion the epipole is at infinity: nothing is near to it.
+        apart = (x - ex) ** 2 + (y - ey) ** 2
+        if not b[2] > 0.0 or apart < gates[1] ** 2 * spread:  # what is not in front fits no line
+            x, y = np.nan, np.nan
+        plane[0, j], plane[1, j], limits[j] = x, y, gates[0] * spread
+    lines, matches = np.empty((len(rows), 3), np.float32), np.full(len(rows), -1, np.int64)
+    _epipolar_lines(bearings, rows, T, lines)
+    here, near = np.empty((len(rows), 4), np.uint64), np.empty((n, 4), np.uint64)
+    _rows_of(first, rows, here)
+    _rows_of(second, there, near)
+    search_lines(here, lines, near, plane, limits, size, ratio, limit, matches)
+    found = 0
+    for i in range(len(rows)):
+        if matches[i] >= 0:
+            pairs[found, 0], pairs[found, 1] = rows[i], there[matches[i]]
+            found += 1
+    return found
 
 
 @kernel

@@ -30,7 +30,7 @@ from odomap.vision.hamming import (
     fill_cells,
     search_all,
     search_circles,
-    search_lines,
+    search_epipolar,
 )
 
 __all__ = [
@@ -313,31 +313,25 @@ def match_epipolar(
     Returns:
         (P, 2) index pairs, ordered by the first; each is the best of the other near its line.
     """
-    rows, others = np.flatnonzero(first.usable), np.flatnonzero(second.usable)
-    matches = np.full(len(rows), -1, np.int64)
-    if len(rows) and len(others):
-        R, t = T_second_first[:3, :3], T_second_first[:3, 3]
-        points = second.bearings[others]
-        levels = second.levels[others]
-        with np.errstate(divide="ignore", invalid="ignore"):  # what is not in front fits no line
-            plane = np.where(points[:, 2:] > 0, points[:, :2] / points[:, 2:], np.nan)
-            variance = (sigma * scale ** levels.astype(np.float64)) ** 2
-            # Of a sideways motion the epipole is at infinity: nothing is near to it.
-            apart = ((plane - t[:2] / t[2]) ** 2).sum(axis=1)
-            plane[apart < EPIPOLE_SIGMAS**2 * variance] = np.nan
-        search_lines(
-            as_words(first.descriptors[rows]),
-            np.cross(t, first.bearings[rows] @ R.T).astype(np.float32),
-            as_words(second.descriptors[others]),
-            np.ascontiguousarray(plane.T, np.float32),
-            (CHI2 * variance).astype(np.float32),
-            levels,
-            config.ratio,
-            config.max_hamming,
-            matches,
-        )
-    hit = matches >= 0
-    return np.stack([rows[hit], others[matches[hit]]], axis=1)
+    coarsest = max(int(second.levels.max(initial=0)), 0)
+    variance = (sigma * scale ** np.arange(coarsest + 1, dtype=np.float64)) ** 2
+    pairs = np.empty((min(len(first.usable), len(second.usable)), 2), np.int64)
+    found = search_epipolar(
+        as_words(first.descriptors),
+        np.ascontiguousarray(first.bearings, np.float64),
+        np.ascontiguousarray(first.usable),
+        as_words(second.descriptors),
+        np.ascontiguousarray(second.bearings, np.float64),
+        np.ascontiguousarray(second.levels),
+        np.ascontiguousarray(second.usable),
+        np.ascontiguousarray(T_second_first),
+        variance,
+        np.array([CHI2, EPIPOLE_SIGMAS]),
+        config.ratio,
+        config.max_hamming,
+        pairs,
+    )
+    return pairs[:found]
 
 
 def nearest(first: Descriptors, second: Descriptors) -> tuple[Index, Index, Index]:
