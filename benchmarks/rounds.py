@@ -1,12 +1,15 @@
 """Does a map grow with the space seen, or with time? Ten rounds of one room say.
 
-    python benchmarks/rounds.py [--rounds 10] [--presets stereo stereo-flow ...] [--json FILE]
+    python benchmarks/rounds.py [--rounds 10] [--presets stereo stereo-flow ...] [--periodic]
 
 A camera is carried round a simulated room again and again; no round is the same to the pixel (the
 hand sways, exposure and noise differ). What the map holds after the last round is compared with
 what it held after the second: keyframes, landmarks, bytes of the file, and memory of the process
 over what it held before the first frame, all at most 1.3 times as much. The exit code is 1 where
 one is more, or where a frame is lost.
+
+With --periodic the hand sways in time with the rounds, so that each is exactly the last again, but
+for noise and exposure: what still grows then grows with time alone.
 
 The room is rendered once, with all sensors, and played to each preset in a process of its own. Low
 resolution and rate keep that short.
@@ -21,8 +24,8 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path as File
 
 import cv2
 import numpy as np
@@ -30,10 +33,12 @@ from memory import release_freed
 from numpy.lib.format import open_memmap
 
 from odomap.files.mapfile import save_map
+from odomap.geometry.trajectory import Trajectory
 from odomap.kernels import modules_with_kernels, warm_up
 from odomap.maps.estimate import Status
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
+from odomap.simulation.path import Harmonics, Path
 from odomap.simulation.world import World
 from odomap.system.config import preset
 from odomap.system.slam import Slam
@@ -67,13 +72,13 @@ class Held:
 class Rendered:
     """Frames of a world in files, so that several processes can play them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: File) -> None:
         names = "left", "right", "depth", "stamps"
         arrays = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in names)
         self._left, self._right, self._depth, self._stamps = arrays
 
     @classmethod
-    def of(cls, world: World, folder: Path) -> "Rendered":
+    def of(cls, world: World, folder: File) -> "Rendered":
         """Render all frames of a world into files."""
         width, height = world.spec.resolution
         shape = len(world), height, width
@@ -108,7 +113,7 @@ def main() -> int:
     grown: dict[str, list[Held]] = {}
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="odomap-rounds-") as folder:
-        Rendered.of(world, Path(folder))
+        Rendered.of(world, File(folder))
         print(f"rendered in {time.perf_counter() - start:.0f} s", flush=True)
         rig = world.rig.without_imu()
         spawn = multiprocessing.get_context("spawn")
@@ -121,7 +126,7 @@ def main() -> int:
         print(f"bar missed: {line}")
     if options.json:
         content = {name: [asdict(held) for held in rounds] for name, rounds in grown.items()}
-        Path(options.json).write_text(json.dumps(content, indent=1), encoding="utf-8")
+        File(options.json).write_text(json.dumps(content, indent=1), encoding="utf-8")
     return 1 if missed else 0
 
 
@@ -133,6 +138,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--resolution", default="320x200")
     parser.add_argument("--rate", type=float, default=10.0, help="frames per second")
     parser.add_argument("--speed", type=float, default=0.6, help="of the camera, m/s")
+    parser.add_argument("--periodic", action="store_true", help="every round is the same")
     parser.add_argument("--json", help="write all numbers here")
     options = parser.parse_args()
     if options.rounds < 2:
@@ -147,7 +153,23 @@ def room(options: argparse.Namespace) -> tuple[World, int]:
     fields |= {"resolution": (width, height), "speed": options.speed}
     fields["sensors"] = ("stereo", "depth")
     each = round(options.rate / World.make(**fields, frames=1).path.rounds_per_s)
-    return World.make(**fields, frames=options.rounds * each), each
+    world = World.make(**fields, frames=options.rounds * each)
+    if options.periodic:  # a world has no field for it: its path is put in place of another
+        world._path = periodic(world.path)
+        stamps = world.truth.stamps_ns
+        world.truth = Trajectory(stamps, world._at(stamps))
+    return world, each
+
+
+def periodic(path: Path) -> Path:
+    """Return a path whose sway and pace repeat with every round."""
+
+    def in_time(sway: Harmonics) -> Harmonics:
+        once = 2 * np.pi * path.rounds_per_s
+        return replace(sway, omega=once * np.maximum(1.0, np.rint(sway.omega / once)))
+
+    sways = {name: in_time(getattr(path, name)) for name in ("unevenness", "sway", "tilt")}
+    return replace(path, **sways)
 
 
 def play(folder: str, rig: Rig, name: str, each: int) -> list[Held]:
@@ -162,12 +184,12 @@ def play(folder: str, rig: Rig, name: str, each: int) -> list[Held]:
     rounds: list[Held] = []
     statuses: list[Status] = []
     ms: list[float] = []
-    for frame in Rendered(Path(folder)):
+    for frame in Rendered(File(folder)):
         start = time.perf_counter()
         statuses.append(system.track(frame).status)
         ms.append(1e3 * (time.perf_counter() - start))
         if len(ms) == each:
-            path = Path(folder) / f"{name}.odomap"
+            path = File(folder) / f"{name}.odomap"
             save_map(path, system.map, rig)
             rounds.append(
                 Held(
@@ -191,7 +213,7 @@ def private_mb() -> float:
     """
     gc.collect()
     release_freed()
-    statm = Path("/proc/self/statm")
+    statm = File("/proc/self/statm")
     if not statm.exists():
         sys.exit("rounds.py: reads /proc/self/statm, which only Linux has")
     resident, shared = (int(n) for n in statm.read_text(encoding="ascii").split()[1:3])

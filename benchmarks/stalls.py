@@ -295,7 +295,8 @@ def print_costs(what: str, runs: list[Costs]) -> None:
         middle = min(float(np.median(costs.parts[part] or [0.0])) for costs in runs)
         worst = min(max(costs.parts[part], default=0.0) for costs in runs)
         print(f"  {part:6} {middle:7.2f} ms median, {worst:.2f} ms longest, own time")
-    print(f"  beside {stall.beside_ms:+7.2f} ms, of {stall.beside} frames", flush=True)
+    beside = f"{stall.beside_ms:+7.2f} ms" if stall.beside else "      0 ms"
+    print(f"  beside {beside}, of {stall.beside} frames", flush=True)
 
 
 if __name__ == "__main__":

@@ -32,13 +32,25 @@ def test_what_grows_from_the_second_round_on_is_told(rounds):
 
 
 def test_rooms_are_gone_round_as_often_as_asked_for(rounds):
-    options = SimpleNamespace(resolution="64x48", rate=10.0, speed=0.6, seed=1, rounds=3)
+    options = SimpleNamespace(
+        resolution="64x48", rate=10.0, speed=0.6, seed=1, rounds=3, periodic=False
+    )
     world, each = rounds.room(options)
     assert len(world) == 3 * each
     places = world.truth.Ts_world_body[:, :3, 3]
     again = np.linalg.norm(places[each:] - places[:-each], axis=1)
     across = np.linalg.norm(places - places.mean(0), axis=1)
     assert np.median(again) < 0.3 < np.median(across)
+
+
+def test_periodic_rounds_are_the_same_again(rounds):
+    world = World.make(frames=2, resolution=(64, 48))
+    path = rounds.periodic(world.path)
+    times = np.linspace(0, 10, 7)
+    here, later = path.at(times), path.at(times + 1 / path.rounds_per_s)
+    np.testing.assert_allclose(later.Ts_world_body, here.Ts_world_body, atol=1e-9)
+    swaying = world.path.at(times).Ts_world_body[:, :3, 3]
+    assert np.linalg.norm(swaying - here.Ts_world_body[:, :3, 3], axis=1).max() < 0.5
 
 
 def test_rendered_frames_are_those_of_the_world(rounds, tmp_path):
