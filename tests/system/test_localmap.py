@@ -27,7 +27,7 @@ def local_of(points, normals=None, distance=None, level=None):
         np.linalg.norm(points, axis=1) if distance is None else np.asarray(distance, float),
         np.full(n, 3, np.uint8) if level is None else np.asarray(level, np.uint8),
     )
-    return LocalMap(0, views, np.full((n, 2), np.nan), np.zeros(n))
+    return LocalMap(0, views, np.full((n, 2), np.nan), np.zeros(n), np.ones(n, bool))
 
 
 def expected(local, T_camera_world=None, rows=None):

@@ -42,7 +42,8 @@ def landmarks(count=300, seed=0, relative=0.0):
         rng.integers(0, 6, count).astype(np.uint8),
     )
     nowhere = np.full((count, 2), np.nan)
-    return LocalMap(0, views, nowhere, np.full(count, float(relative)))
+    settled = np.ones(count, np.bool_)
+    return LocalMap(0, views, nowhere, np.full(count, float(relative)), settled)
 
 
 def seen(local, T_world_body=T_TRUE, sigma_px=0.4, clutter=150, seed=1, lies=0, hidden=0.0):
@@ -158,7 +159,7 @@ def test_no_feature_belongs_to_two_landmarks(guess):
         np.concatenate([v.distance, v.distance]),
         np.concatenate([v.level, v.level]),
     )
-    doubled = LocalMap(0, twice, np.full((600, 2), np.nan), np.zeros(600))
+    doubled = LocalMap(0, twice, np.full((600, 2), np.nan), np.zeros(600), np.ones(600, np.bool_))
     view, _, _ = seen(local)
     # Half of them are likely, the twins are looked for afterwards.
     located = locate(doubled, view, off_by(*guess), likely=np.arange(300))

@@ -43,6 +43,14 @@ class Sightings:
     disparity: Array
     weights: Array
 
+    def at(self, which: NDArray[np.bool_]) -> "Sightings":
+        """Return some of them, by a mask (N,)."""
+        if which.all():
+            return self
+        return Sightings(
+            self.points_world[which], self.xy[which], self.disparity[which], self.weights[which]
+        )
+
 
 @dataclass(frozen=True)
 class MotionSolution:

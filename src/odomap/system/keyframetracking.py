@@ -16,6 +16,7 @@ from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.association import Association, Reference, View
 from odomap.system.config import Config
+from odomap.system.dispute import SETTLED
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located, Locator
@@ -68,8 +69,9 @@ class KeyframeTracker(Tracker[Reference]):
 
     def _try(self, view: View, known: Reference, T_world_body: Array, needed: int) -> Located:
         points = self._map.points_world(known.landmark_ids)
+        is_settled = self._map.count_observers(known.landmark_ids) >= SETTLED
         T_reference = self._map.T_world_body(known.keyframe_id)
-        return self._locator.locate(view, known, points, T_reference, T_world_body)
+        return self._locator.locate(view, known, points, is_settled, T_reference, T_world_body)
 
     def _without_guess(self, view: View, known: Reference) -> tuple[Reference, Located] | None:
         """Compare descriptors with those of the last keyframe."""

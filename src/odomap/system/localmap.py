@@ -21,6 +21,7 @@ from odomap.geometry.camera import Camera
 from odomap.limits import Count, NotNegative, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.maps.views import LandmarkViews
+from odomap.system.dispute import SETTLED
 from odomap.system.maplocating_kernels import foresee
 
 __all__ = ["Expected", "LocalMap", "LocalMapConfig", "expect", "local_map"]
@@ -64,12 +65,14 @@ class LocalMap:
         views: the N landmarks, and how they were seen.
         keypoints: (N, 2) where in that keyframe; NaN where it does not see them.
         relative: (N,) standard deviation of a landmark's distance as a fraction of it.
+        is_settled: (N,) whether several keyframes agree on it.
     """
 
     keyframe_id: int
     views: LandmarkViews
     keypoints: Array
     relative: Array
+    is_settled: NDArray[np.bool_]
 
     @property
     def landmark_ids(self) -> Index:
@@ -121,11 +124,11 @@ def local_map(
     if features is not None and len(seen):
         at = np.searchsorted(views.ids, seen)
         keypoints[at] = features.keypoints[rows]
+    observers = map.count_observers(views.ids)
     relative = np.zeros(len(views))
     if sigma is not None:
-        observers = np.maximum(map.count_observers(views.ids), 1)
-        relative = sigma * views.distance / np.sqrt(observers)
-    return LocalMap(keyframe_id, views, keypoints, relative)
+        relative = sigma * views.distance / np.sqrt(np.maximum(observers, 1))
+    return LocalMap(keyframe_id, views, keypoints, relative, observers >= SETTLED)
 
 
 @dataclass(frozen=True, eq=False)

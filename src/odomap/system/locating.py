@@ -17,6 +17,7 @@ from odomap.backend.motion import MotionSolution, Sightings, solve_motion
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.system.association import Association, Reference, View
+from odomap.system.dispute import settle
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.flow import facing_warp
@@ -70,6 +71,7 @@ class Locator:
         view: View,
         reference: Reference,
         points_world: Array,
+        is_settled: NDArray[np.bool_],
         T_world_reference: Array,
         T_world_body: Array,
     ) -> Located:
@@ -79,6 +81,7 @@ class Locator:
             view: the image.
             reference: the keyframe whose landmarks are looked for.
             points_world: (N, 3) those landmarks now; NaN where gone.
+            is_settled: (N,) whether several keyframes agree on each.
             T_world_reference: (4, 4) the keyframe's pose now.
             T_world_body: (4, 4) predicted pose of the view.
 
@@ -109,7 +112,11 @@ class Locator:
         sightings = Sightings(
             points_world[rows], self._normalised(pixels), np.full(len(rows), np.nan), weights
         )
-        solution = self._solve(T_world_body, sightings)
+
+        def solve(which: NDArray[np.bool_], T: Array, iterations: int) -> MotionSolution:
+            return self._solve(T, sightings.at(which), iterations)
+
+        solution = settle(solve, is_settled[rows], T_world_body)
         factor = self._noise.overlap * variance_factor(solution)
         return Located(
             solution.T_world_body,
@@ -120,8 +127,14 @@ class Locator:
             int(found.size),
         )
 
-    def _solve(self, T_world_body: Array, sightings: Sightings) -> MotionSolution:
-        return solve_motion(T_world_body, self._T_camera_body, UNIT_BASELINE, sightings)
+    def _solve(self, T_world_body: Array, sightings: Sightings, iterations: int) -> MotionSolution:
+        return solve_motion(
+            T_world_body,
+            self._T_camera_body,
+            UNIT_BASELINE,
+            sightings,
+            iterations=iterations,
+        )
 
     def _project(self, points_camera: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):

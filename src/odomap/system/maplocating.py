@@ -18,6 +18,7 @@ from odomap.backend.motion import MotionSolution, Sightings, solve_motion
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.system.association import View
+from odomap.system.dispute import settle
 from odomap.system.localmap import LocalMap, LocalMapConfig, expect
 from odomap.system.locating import Located, variance_factor
 from odomap.system.maplocating_kernels import weigh
@@ -73,7 +74,7 @@ class MapLocator:
         rows, found, expected = self._search_for(
             view, grid, local, likely, T_world_body, self._search.first_radius_px
         )
-        solution = self._solve(view, local, rows, found, T_world_body)
+        solution = self._settled(view, local, rows, found, T_world_body)
         if int(solution.inliers.sum()) < needed or not solution.converged:
             return self._located(view, rows, found, solution, expected)
         rows, found = rows[solution.inliers], found[solution.inliers]
@@ -84,7 +85,7 @@ class MapLocator:
             view, grid, local, others, solution.T_world_body, self._search.radius_px, found
         )
         rows, found = np.concatenate([rows, more]), np.concatenate([found, at])
-        solution = self._solve(view, local, rows, found, solution.T_world_body)
+        solution = self._settled(view, local, rows, found, solution.T_world_body)
         return self._located(view, rows, found, solution, len(rows) - len(more) + around)
 
     def _search_for(
@@ -120,8 +121,24 @@ class MapLocator:
             matched &= is_free[index]
         return there.rows[matched], index[matched], len(there.rows)
 
-    def _solve(
+    def _settled(
         self, view: View, local: LocalMap, rows: Index, found: Index, T_world_body: Array
+    ) -> MotionSolution:
+        """Find the pose that agrees with matches; in a dispute, with those of settled landmarks."""
+
+        def solve(which: NDArray[np.bool_], T: Array, iterations: int) -> MotionSolution:
+            return self._solve(view, local, rows[which], found[which], T, iterations)
+
+        return settle(solve, local.is_settled[rows], T_world_body)
+
+    def _solve(
+        self,
+        view: View,
+        local: LocalMap,
+        rows: Index,
+        found: Index,
+        T_world_body: Array,
+        iterations: int,
     ) -> MotionSolution:
         """Find the pose that agrees with matches of landmarks and features."""
         T_camera_world = self._T_camera_body @ se3_inverse(T_world_body)
@@ -145,7 +162,13 @@ class MapLocator:
             weights,
         )
         sightings = Sightings(points, xy, np.full(n, np.nan), weights)
-        return solve_motion(T_world_body, self._T_camera_body, UNIT_BASELINE, sightings)
+        return solve_motion(
+            T_world_body,
+            self._T_camera_body,
+            UNIT_BASELINE,
+            sightings,
+            iterations=iterations,
+        )
 
     def _located(
         self, view: View, rows: Index, found: Index, solution: MotionSolution, expected: int

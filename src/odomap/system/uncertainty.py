@@ -48,7 +48,7 @@ class NoiseConfig:
 
     position_px: Positive = 0.4
     """Standard deviation of the position of a point followed by optical flow."""
-    feature_px: Positive = 0.7
+    feature_px: Positive = 0.45
     """Standard deviation of the position of a feature found on the finest level of the pyramid."""
     overlap: Positive = 4.0
     """Factor on variances for errors that observations share: patches overlap, tracks go on."""
