@@ -30,6 +30,9 @@ __all__ = ["StereoConfig", "match_sparse", "sgbm_disparity"]
 
 Image = NDArray[np.uint8]
 
+MOST_HALF = 7
+"""Sums over windows of up to this half side, 225 differences, go into 16 bits."""
+
 
 @dataclass(frozen=True)
 class StereoConfig:
@@ -82,7 +85,7 @@ def match_sparse(
     low = np.full(n, -2.0) if lowest is None else np.maximum(lowest, -2.0)
     high = np.full(n, float(config.max_disparity_px)) if highest is None else highest
     high = np.minimum(high, float(config.max_disparity_px))
-    coarse = np.full(n, np.nan)
+    coarse, width = np.full(n, np.nan), left.shape[1]
     _search_kernel(
         left,
         right,
@@ -91,6 +94,9 @@ def match_sparse(
         np.ceil(high).astype(np.int64),
         config.half_search_px,
         config.uniqueness,
+        np.empty(width, np.uint16)
+        if config.half_search_px <= MOST_HALF
+        else np.empty(width, np.int32),
         coarse,
     )
     disparity = np.full(n, np.nan)
@@ -120,14 +126,15 @@ def _search_kernel(
     high: NDArray[np.int64],
     half: int,
     uniqueness: float,
+    scores: NDArray[np.uint16] | NDArray[np.int32],
     disparity: NDArray[np.float64],
 ) -> None:
     """argmin_d Σ |L(x + u, y + v) − R(x − d + u, y + v)| over whole d, if clearly the best.
 
-    The innermost loop runs along the row of the right image, over all candidates at once.
+    The innermost loop runs along the row of the right image, over all candidates at once; the
+    narrower the scores, the more of them.
     """
     height, width = left.shape
-    scores = np.empty(width, np.int32)
     for i in range(len(points)):
         x, y = int(np.floor(points[i, 0] + 0.5)), int(np.floor(points[i, 1] + 0.5))
         if x < half or y < half or x >= width - half or y >= height - half:
@@ -139,12 +146,12 @@ def _search_kernel(
         scores[:count] = 0
         for v in range(-half, half + 1):
             for u in range(-half, half + 1):
-                grey = np.int32(left[y + v, x + u])
+                grey = left[y + v, x + u]
                 row = right[y + v, begin + u : begin + u + count]
                 for k in range(count):
-                    scores[k] += abs(grey - np.int32(row[k]))
+                    scores[k] += max(grey, row[k]) - min(grey, row[k])
         at = np.argmin(scores[:count])
-        other = np.int32(2**30)
+        other = 2**30
         for k in range(count):
             if abs(k - at) > 2 and scores[k] < other:
                 other = scores[k]
