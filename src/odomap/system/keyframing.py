@@ -211,10 +211,12 @@ class Keyframes:
         rows = np.concatenate([np.arange(n), n + placed])
         self._map.add_observations(keyframe_id, ids, rows)
         history = self._history(keyframe_id, seen, placed)
-        self._observed_before(new, history.at(placed))
+        self._observed_before(keyframe_id, new, history.at(placed))
         keypoints = features.keypoints.astype(np.float64)
         keypoints[:n] = seen.pixels
-        rest = np.setdiff1d(np.arange(len(history)), placed)
+        is_rest = np.ones(len(history), np.bool_)
+        is_rest[placed] = False
+        rest = np.flatnonzero(is_rest)
         return self._reference(
             keyframe_id,
             view,
@@ -296,9 +298,11 @@ class Keyframes:
         keyframes[unfilled, column], rows[unfilled, column] = keyframe_id, n + unfilled
         return Candidates(keypoints, seen.features.descriptors[n:], first_at, keyframes, rows)
 
-    def _observed_before(self, landmark_ids: Index, history: Candidates) -> None:
+    def _observed_before(self, keyframe_id: int, landmark_ids: Index, history: Candidates) -> None:
         """Tell the map which earlier keyframes have seen new landmarks."""
-        seen_by = np.unique(history.keyframes[history.keyframes >= 0]).tolist()
+        seen_by = np.flatnonzero(np.bincount(history.keyframes[history.keyframes >= 0])).tolist()
+        if seen_by == [keyframe_id]:  # which is known to see them
+            return
         # Those that were culled, or have left an odometry's window, know nothing any more.
         known = [
             k
