@@ -1,6 +1,6 @@
 """What a system makes of faults of its cameras: is a pose right, or said not to be known?
 
-    python benchmarks/faults.py [--systems StereoVO MonocularVO RgbdVO] [--faults NAME ...]
+    python benchmarks/faults.py [--systems "Slam stereo" StereoVO ...] [--faults NAME ...]
                                 [--seed 3] [--reasons] [--json FILE]
 
 A simulated room is seen by a stereo pair, a single camera and a camera with depth, and disturbed:
@@ -19,15 +19,20 @@ from pathlib import Path
 
 from odomap.maps.estimate import Status
 from odomap.system.odometry import MonocularVO, RgbdVO, StereoVO
+from odomap.system.slam import Slam
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from faultworlds import SPEC, Recordings, faults_of, judge
 
 SYSTEMS = {
+    "Slam stereo": ("stereo", Slam),
+    "Slam mono": ("mono", Slam),
+    "Slam rgbd": ("rgbd", Slam),
     "StereoVO": ("stereo", StereoVO),
     "MonocularVO": ("mono", lambda rig: MonocularVO(rig.cameras[0].camera)),
     "RgbdVO": ("rgbd", RgbdVO),
 }
+DEFAULT = [name for name in SYSTEMS if name.startswith("Slam")]
 
 
 def main() -> int:
@@ -71,7 +76,7 @@ def _print_reasons(estimates, wrong) -> None:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=list(SYSTEMS))
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=DEFAULT)
     parser.add_argument(
         "--faults", nargs="+", choices=faults_of("stereo"), metavar="NAME", help="default all"
     )
