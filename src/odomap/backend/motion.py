@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.cholesky import factor, invert, solve
-from odomap.backend.residuals import huber_weight, reproject, reproject_with_jacobians
+from odomap.backend.residuals import huber_weight, reproject
 from odomap.geometry.lie_kernels import se3_retract
 from odomap.kernels import kernel
 
@@ -120,6 +120,62 @@ def solve_motion(
 
 
 @kernel
+def _add(
+    R: Array,
+    t: Array,
+    R_cb: Array,
+    t_cb: Array,
+    baseline: float,
+    p: Array,
+    xy: Array,
+    disparity: float,
+    weights: Array,
+    width: float,
+    J: Array,
+    H: Array,
+    b: Array,
+) -> None:
+    """Add w JᵀJ to the lower half of H and −w Jᵀr to b, for a point in front of the camera.
+
+    J is that of `reproject_with_jacobians`, in a scratch array; without a disparity it is two rows.
+    """
+    q0, q1, q2 = p[0] - t[0], p[1] - t[1], p[2] - t[2]
+    b0 = R[0, 0] * q0 + R[1, 0] * q1 + R[2, 0] * q2
+    b1 = R[0, 1] * q0 + R[1, 1] * q1 + R[2, 1] * q2
+    b2 = R[0, 2] * q0 + R[1, 2] * q1 + R[2, 2] * q2
+    X = R_cb[0, 0] * b0 + R_cb[0, 1] * b1 + R_cb[0, 2] * b2 + t_cb[0]
+    Y = R_cb[1, 0] * b0 + R_cb[1, 1] * b1 + R_cb[1, 2] * b2 + t_cb[1]
+    Z = R_cb[2, 0] * b0 + R_cb[2, 1] * b1 + R_cb[2, 2] * b2 + t_cb[2]
+    if not Z > 1e-3:
+        return
+    inverse = 1.0 / Z
+    x, y, scale = X * inverse, Y * inverse, weights[0] * inverse
+    r0, r1, r2 = weights[0] * (x - xy[0]), weights[0] * (y - xy[1]), 0.0
+    rows, bend = 2, 0.0
+    if disparity == disparity:
+        rows, r2 = 3, weights[1] * (baseline * inverse - disparity)
+        bend = -weights[1] * baseline * inverse * inverse
+    for k in range(3):
+        J[0, k] = -(scale * (R_cb[0, k] - x * R_cb[2, k]))
+        J[1, k] = -(scale * (R_cb[1, k] - y * R_cb[2, k]))
+        J[2, k] = -(bend * R_cb[2, k])
+    for i in range(rows):
+        J[i, 3] = J[i, 2] * b1 - J[i, 1] * b2
+        J[i, 4] = J[i, 0] * b2 - J[i, 2] * b0
+        J[i, 5] = J[i, 1] * b0 - J[i, 0] * b1
+    w = huber_weight(r0 * r0 + r1 * r1 + r2 * r2, width)
+    for i in range(6):
+        if rows == 3:
+            b[i] -= w * (J[0, i] * r0 + J[1, i] * r1 + J[2, i] * r2)
+            for k in range(6):
+                H[i, k] += w * (J[0, i] * J[0, k] + J[1, i] * J[1, k] + J[2, i] * J[2, k])
+        else:
+            b[i] -= w * (J[0, i] * r0 + J[1, i] * r1)
+            for k in range(6):
+                H[i, k] += w * (J[0, i] * J[0, k] + J[1, i] * J[1, k])
+
+
+@kernel
 def _solve_kernel(
     R: Array,
     t: Array,
@@ -137,7 +193,7 @@ def _solve_kernel(
     covariance: Array,
 ) -> bool:
     """Gauss-Newton, R and t in place: first with all observations, then with those in the gate."""
-    r, J, P = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    r, J = np.empty(3), np.empty((3, 6))
     H, b = np.empty((6, 6)), np.empty(6)
     R_new, t_new = np.empty((3, 3)), np.empty(3)
     converged, size = False, np.inf
@@ -152,17 +208,22 @@ def _solve_kernel(
             b[:] = 0.0
             for o in range(len(xy)):
                 # A gate twice as wide at first lets back in what a poor start put outside.
-                if phase == 1 and chi2[o] > 4.0 * gate * gate:
-                    continue
-                if not reproject_with_jacobians(
-                    R, t, R_cb, t_cb, baseline, points[o], xy[o], disparity[o], weights[o], r, J, P
-                ):
-                    continue
-                w = huber_weight(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], width)
-                for a in range(6):
-                    b[a] -= w * (J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2])
-                    for c in range(a + 1):
-                        H[a, c] += w * (J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c])
+                if phase == 0 or chi2[o] <= 4.0 * gate * gate:
+                    _add(
+                        R,
+                        t,
+                        R_cb,
+                        t_cb,
+                        baseline,
+                        points[o],
+                        xy[o],
+                        disparity[o],
+                        weights[o],
+                        width,
+                        J,
+                        H,
+                        b,
+                    )
             converged = False
             if not factor(H):
                 return False
