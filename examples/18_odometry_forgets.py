@@ -34,7 +34,7 @@ def main() -> dict[str, list[tuple[float, int, int]]]:
                 results[name].append((off, keyframes, landmarks))
                 number = len(results[name])
                 print(
-                    f"{name:6} round {number}: off by {off:.1f} mm,"
+                    f"{name:6} round {number}: off by {off:.0f} mm,"
                     f" {keyframes} keyframes, {landmarks} landmarks"
                 )
     return results

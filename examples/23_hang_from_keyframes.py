@@ -24,7 +24,7 @@ def rms(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum((found - true) ** 2, axis=1))))
 
 
-def main() -> dict[str, tuple[float, float]]:
+def main() -> dict[str, np.ndarray]:
     true, found, map, hung, points = walk(0.0), walk(0.002), Map(), [], []
     for n, T in enumerate(found):
         if n % BETWEEN == 0:
@@ -48,7 +48,7 @@ def main() -> dict[str, tuple[float, float]]:
     stale[::BETWEEN] = hanging[::BETWEEN]  # keyframes are corrected, frames keep their poses
     for name, path in (("stored in the world", stale), ("hung from keyframes", hanging)):
         off, jump = rms(path, truth), np.linalg.norm(np.diff(path, axis=0), axis=1).max()
-        results[name] = off, jump
+        results[name] = path
         print(f"frames {name}: off by {off:.2f} m, steps of up to {jump:.2f} m")
     off = [rms(p, np.concatenate(points)) for p in (before, map.points_world(map.landmark_ids))]
     print(f"landmarks: off by {off[0]:.2f} m before, {off[1]:.2f} m after")

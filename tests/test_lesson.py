@@ -13,12 +13,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from printed import assert_same_output
 
 ROOT = Path(__file__).parent.parent
 LESSON = ROOT / "docs" / "lesson"
+ORB_SLAM = LESSON / "03_orb_slam.md"
 BACK_END = LESSON / "05_loop_closure_and_optimisation.md"
 PAGES = sorted(LESSON.glob("*.md"))
 CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
@@ -55,6 +57,7 @@ def test_there_are_chapters():
     assert [page.name for page in CHAPTERS] == [
         "01_what_is_slam.md",
         "02_visual_odometry.md",
+        "03_orb_slam.md",
         "05_loop_closure_and_optimisation.md",
     ]
 
@@ -122,14 +125,20 @@ def ran(name: str) -> tuple[Any, str]:
     return results, printed.getvalue()
 
 
-@pytest.mark.parametrize("name", shown_outputs(BACK_END))
-def test_the_back_end_prints_what_is_shown(name):
-    assert_same_output(ran(name)[1], shown_outputs(BACK_END)[name])
+SHOWN = shown_outputs(BACK_END) | shown_outputs(ORB_SLAM)
 
 
-def test_all_examples_of_the_back_end_are_shown():
-    files = {path.name for path in (ROOT / "examples").glob("1[2-7]_*.py")}
-    assert files == set(shown_outputs(BACK_END))
+@pytest.mark.parametrize("name", SHOWN)
+def test_an_example_prints_what_is_shown(name):
+    assert_same_output(ran(name)[1], SHOWN[name])
+
+
+@pytest.mark.parametrize(
+    ("page", "numbers"), [(BACK_END, range(12, 18)), (ORB_SLAM, range(18, 24))]
+)
+def test_all_examples_of_a_chapter_are_shown(page, numbers):
+    files = {p.name for p in (ROOT / "examples").glob("[0-9]*.py") if int(p.name[:2]) in numbers}
+    assert files == set(shown_outputs(page))
 
 
 def test_only_the_graph_knows_where_the_drift_came_from():
@@ -163,6 +172,41 @@ def test_only_the_bundle_is_honest():
     assert results["edges, next"] < 0.4
     assert 0.8 < results["sightings"] < 1.2
     assert results["edges, all"] > 3.0
+
+
+def test_a_map_is_used_again_and_an_odometry_begins_anew():
+    results = ran("18_odometry_forgets.py")[0]
+    (odometry_mm, odometry_keyframes, _), (map_mm, map_keyframes, _) = (
+        results[name][-1] for name in ("RgbdVO", "Slam")
+    )
+    assert 2.0 * map_mm < odometry_mm
+    assert 2 * map_keyframes < odometry_keyframes
+
+
+def test_an_angle_makes_bits_that_turn():
+    results = ran("19_features_by_hand.py")[0]
+    assert 4 * results["with"] < results["without"]
+
+
+def test_a_third_view_is_worth_more_than_all_other_checks():
+    wrong = [percent for _, percent in ran("21_checks_of_new_points.py")[0].values()]
+    assert wrong == sorted(wrong, reverse=True)
+    assert 10 * wrong[-1] < wrong[-2] < wrong[0] / 2
+
+
+def test_a_window_is_held_by_those_that_see_its_points():
+    results = ran("22_fixed_keyframes.py")[0]
+    assert results["others that see it"] < 1.5  # two numbers of standard deviation 1
+    assert min(results["its oldest two"], results["its oldest one"]) > 5.0
+
+
+def test_what_hangs_from_keyframes_has_no_cracks():
+    paths = ran("23_hang_from_keyframes.py")[0]
+    jumps = {
+        name: np.linalg.norm(np.diff(path, axis=0), axis=1).max() for name, path in paths.items()
+    }
+    assert jumps["hung from keyframes"] < 0.12  # a step is 0.1 m
+    assert jumps["stored in the world"] > 0.3
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
