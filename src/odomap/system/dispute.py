@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.motion import MotionSolution
 
-__all__ = ["SETTLED", "settle"]
+__all__ = ["FEWEST", "SETTLED", "settle"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,8 +29,10 @@ SETTLED = 2
 """Keyframes that must see a landmark for it to be settled."""
 FEWEST = 15
 """With fewer settled landmarks there is nobody to decide."""
-SHARE = 0.85
+UNDISPUTED = 0.95
 """Part of the settled ones that agree with a pose nobody disputes."""
+UNITED = 0.85
+"""Part of the settled ones that must agree with each other for them to decide."""
 ITERATIONS = 10
 """Most steps of each round of a solution."""
 GATE = 3.5
@@ -55,11 +57,11 @@ def settle(
     full = solve(everything, T_world_body, ITERATIONS)
     count = int(is_settled.sum())
     agreed = int(full.inliers[is_settled].sum()) if full.converged else 0
-    if is_settled.all() or count < FEWEST or agreed >= SHARE * count:
+    if is_settled.all() or count < FEWEST or agreed >= UNDISPUTED * count:
         return full
     first = solve(is_settled, T_world_body, ITERATIONS)
     among = int(first.inliers.sum())
-    if not first.converged or among <= agreed or among < SHARE * count:
+    if not first.converged or among <= agreed or among < UNITED * count:
         return full
     chi2 = solve(everything, first.T_world_body, 0).chi2
     agrees = is_settled | (chi2 <= GATE**2)

@@ -29,6 +29,7 @@ from odomap.maps.estimate import Estimate, Status, Tracks
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.association import Association, TrackingConfig, View
+from odomap.system.dispute import FEWEST, SETTLED
 from odomap.system.eye import Eye
 from odomap.system.locating import Located
 from odomap.system.path import Path, Placed
@@ -63,6 +64,9 @@ K = TypeVar("K", bound=Known)
 
 BLANK = 8.0
 """Standard deviation of grey levels below which an image shows nothing."""
+
+CLEARLY = 1.5
+"""How many times the settled landmarks of the tracked pose must agree with another to win."""
 
 
 class Clock:
@@ -301,9 +305,30 @@ class Tracker(ABC, Generic[K]):
             best = located if best is None or located.num_inliers > best.num_inliers else best
         assert best is not None
         again = self._without_guess(view, known)
-        if again is not None and again[1].num_inliers > best.num_inliers:
+        if again is not None and self._convinces(again, (known, best)):
             return *again, Status.RECOVERED
+        if best.num_inliers >= self._tracking.min_inliers:
+            best = self._try(view, known, best.T_world_body, 0)
         return known, best, tracked
+
+    def _convinces(self, again: tuple[K, Located], tracked: tuple[K, Located]) -> bool:
+        """Say whether a pose found without a guess is to be believed rather than the tracked one.
+
+        What many new landmarks say is worth nothing where settled ones speak against it: they may
+        be on a thing that moves. A pose that goes on as before needs clearly better reasons to be
+        given up.
+        """
+        if tracked[1].num_inliers < self._tracking.min_inliers:
+            return again[1].num_inliers > tracked[1].num_inliers
+        votes, against = self._count_settled(*again), self._count_settled(*tracked)
+        if against < FEWEST:
+            return again[1].num_inliers > tracked[1].num_inliers
+        return votes > CLEARLY * against
+
+    def _count_settled(self, known: K, located: Located) -> int:
+        """Count the settled landmarks that agree with a pose."""
+        ids = known.landmark_ids[located.rows[located.inliers]]
+        return int(np.count_nonzero(self._map.count_observers(ids) >= SETTLED))
 
     def _motions(self, view: View) -> Iterator[Array]:
         """Yield how the body may have moved: steadily, as the images turned, not at all."""
