@@ -26,8 +26,6 @@ from odomap.maps.states import Placement, act
 
 __all__ = ["LandmarkViews", "ViewRows", "views_from"]
 
-_NONE = np.zeros(0, np.uint8)
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkViews:
@@ -87,79 +85,36 @@ def views_from(rows: ViewRows, T_body_camera: NDArray[np.float64]) -> LandmarkVi
         rows: of the map.
         T_body_camera: (4, 4) mount of the camera.
     """
+    # Maps are read and written in places where nobody looks for landmarks: no kernels there.
+    from odomap.maps.views_kernels import look_from
+
     Ts, scales = rows.placements
     centers = act(rows.placements, np.broadcast_to(T_body_camera[:3, 3], (len(Ts), 3)))
-    points = act((Ts.take(rows.anchor, axis=0), scales.take(rows.anchor)), rows.p_anchor)
-    rows = _watched(rows)
-    landmark = np.repeat(np.arange(len(rows.ids)), np.diff(rows.indptr))
-    rays = points.take(landmark, axis=0)
-    rays -= centers.take(rows.observer, axis=0)
-    lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-    rays /= np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
-    normals = _sums(rays, rows.indptr)
-    size = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-    normals /= np.maximum(size, np.finfo(np.float64).tiny)[:, None]
-    reference = _references(rows, landmark)
-    return LandmarkViews(
+    none = np.zeros(0, np.uint8)
+    levels = [none if k.features is None else k.features.level for k in rows.keyframes]
+    number = len(rows.ids)
+    views = LandmarkViews(
         ids=rows.ids,
-        points_world=points,
-        normals=normals,
+        points_world=np.empty((number, 3)),
+        normals=np.empty((number, 3)),
         descriptors=rows.descriptors,
-        distance=lengths[reference],
-        level=_levels(rows.keyframes, rows.observer[reference], rows.keypoint[reference]),
+        distance=np.empty(number),
+        level=np.empty(number, np.uint8),
     )
-
-
-def _watched(rows: ViewRows) -> ViewRows:
-    """Return rows in which the anchor stands in for the observers of a landmark without any."""
-    counts = np.diff(rows.indptr)
-    lonely = np.flatnonzero(counts == 0)
-    if not len(lonely):
-        return rows
-    where = rows.indptr[lonely]
-    counts[lonely] = 1
-    return ViewRows(
-        ids=rows.ids,
-        anchor=rows.anchor,
-        p_anchor=rows.p_anchor,
-        descriptors=rows.descriptors,
-        indptr=offsets(counts),
-        observer=np.insert(rows.observer, where, rows.anchor[lonely]),
-        keypoint=np.insert(rows.keypoint, where, -1),
-        keyframes=rows.keyframes,
-        placements=rows.placements,
+    look_from(
+        rows.anchor,
+        rows.p_anchor,
+        rows.indptr,
+        rows.observer,
+        rows.keypoint,
+        np.ascontiguousarray(Ts),
+        np.ascontiguousarray(scales),
+        np.ascontiguousarray(centers),
+        offsets(np.array([len(column) for column in levels], np.int64)),
+        np.concatenate([none, *levels]),
+        views.points_world,
+        views.normals,
+        views.distance,
+        views.level,
     )
-
-
-def _sums(values: NDArray[np.float64], indptr: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the (N, 3) sums of N non-empty groups of rows."""
-    if len(indptr) == 1:
-        return np.zeros((0, 3))
-    return np.add.reduceat(values, indptr[:-1], axis=0)
-
-
-def _references(rows: ViewRows, landmark: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the observation of each landmark by its anchor, else by its oldest keyframe."""
-    if not len(rows.ids):
-        return np.zeros(0, np.int64)
-    # the order of the keyframes is that of their ids, and the anchor comes before all
-    rank = np.where(rows.observer == rows.anchor[landmark], -1, rows.observer)
-    first = np.minimum.reduceat(rank, rows.indptr[:-1])
-    found = np.flatnonzero(rank == first[landmark])
-    reference = np.zeros(len(rows.ids), np.int64)
-    reference[landmark[found]] = found
-    return reference
-
-
-def _levels(
-    keyframes: Sequence[Keyframe], observer: NDArray[np.int64], keypoint: NDArray[np.int32]
-) -> NDArray[np.uint8]:
-    """Return the pyramid levels of N keypoints, 0 where there is none."""
-    levels = [_NONE if k.features is None else k.features.level for k in keyframes]
-    counts = np.array([len(column) for column in levels], np.int64)
-    known = np.flatnonzero((keypoint >= 0) & (keypoint < counts[observer]))
-    level = np.zeros(len(observer), np.uint8)
-    if len(known):
-        rows = offsets(counts)[observer[known]] + keypoint[known]
-        level[known] = np.concatenate(levels)[rows]
-    return level
+    return views
