@@ -14,7 +14,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from odomap.maps.estimate import Status
@@ -37,7 +37,7 @@ DEFAULT = [name for name in SYSTEMS if name.startswith("Slam")]
 
 def main() -> int:
     options = _options()
-    recordings = Recordings(replace(SPEC, seed=options.seed))
+    recordings = Recordings(options.seed)
     rows = []
     print(
         f"{'system':14}{'fault':24}{'lost':>5}{'off, m':>8}{'off, °':>8}{'leaps':>7}{'broken':>8}"

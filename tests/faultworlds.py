@@ -41,6 +41,9 @@ SPEC = WorldSpec(
     resolution=(320, 200),
     sensors=("stereo", "depth"),
 )
+"""What befalls a pair or a camera with depth."""
+ALONE = replace(SPEC, resolution=(480, 300), sensors=("mono",))
+"""What befalls a single camera: it sees more finely, else it has not started when faults begin."""
 FIRST = 14
 """No fault begins before this frame."""
 SHARE_OF_WAY = 0.02
@@ -175,14 +178,17 @@ def faults_of(sensors):
 class Recordings:
     """What the faults befall, rendered once."""
 
-    def __init__(self, spec=SPEC):
-        self._room, self._turn = Kept(World(spec)), Kept(TurningWorld(spec))
+    def __init__(self, seed=SPEC.seed):
+        self._seed, self._rendered = seed, {}
 
     def disturbed(self, sensors, fault):
         """Return the recording for a kind of system (stereo, mono, rgbd) with a fault."""
-        if fault == TURN:
-            return carrying(self._turn, sensors)
-        return (FAULTS | PAIR_FAULTS)[fault](carrying(self._room, sensors))
+        spec = replace(ALONE if sensors == "mono" else SPEC, seed=self._seed)
+        kind = TurningWorld if fault == TURN else World
+        if (spec, kind) not in self._rendered:
+            self._rendered[spec, kind] = Kept(kind(spec))
+        source = carrying(self._rendered[spec, kind], sensors)
+        return source if fault == TURN else (FAULTS | PAIR_FAULTS)[fault](source)
 
 
 @dataclass(frozen=True)
