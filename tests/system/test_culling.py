@@ -123,7 +123,7 @@ def test_landmarks_on_probation():
         ]
     )
     age, observers, found, expected, ranged, goes = table.T
-    poor = poor_landmarks(age, observers, found, expected, ranged.astype(bool), CullConfig())
+    poor = poor_landmarks(age, observers, found, expected, ranged.astype(bool), CONFIG)
     np.testing.assert_array_equal(poor, np.flatnonzero(goes))
 
 

@@ -15,6 +15,7 @@ from odomap.sensors.frame import Frame
 from odomap.simulation.exposure import ImageNoise, expose, measure_depth
 from odomap.simulation.render import render
 from odomap.simulation.world import START_NS, World
+from odomap.system.background import ThreadConfig
 from odomap.system.config import Config, preset
 from odomap.system.depthbias import DepthBias
 from odomap.system.localmapping import KEPT, LocalMapper
@@ -286,8 +287,8 @@ def test_a_map_is_sound_at_any_time(rounds, sensors, how):
 @pytest.mark.parametrize("how", ["features", "flow"])
 def test_lockstep_makes_the_map_of_inline(rounds, how):
     """To the last bit, and so does every other run."""
-    part, config = rounds.part(0, PER_ROUND), tracker("stereo", how)
-    assert config.threads.mapping_delay == 1
+    part = rounds.part(0, PER_ROUND)
+    config = replace(tracker("stereo", how), threads=ThreadConfig(mapping_delay=1))
     first, one = run(part, config)
     for rhythm in ("inline", "lockstep"):
         again, two = run(part, config, rhythm)
@@ -297,6 +298,17 @@ def test_lockstep_makes_the_map_of_inline(rounds, how):
             np.testing.assert_array_equal(a.Ts_world_body, b.Ts_world_body)
             np.testing.assert_array_equal(a.covariances, b.covariances)
         assert one.mapping == two.mapping
+
+
+def test_a_longer_delay_makes_the_same_map_on_every_run(rounds):
+    part = rounds.part(0, PER_ROUND)
+    config = replace(tracker("stereo", "features"), threads=ThreadConfig(mapping_delay=3))
+    (first, one), (again, two) = (run(part, config, "lockstep") for _ in range(2))
+    same_map(first.map, again.map)
+    np.testing.assert_array_equal(one.trajectory.Ts_world_body, two.trajectory.Ts_world_body)
+    assert not np.array_equal(
+        one.trajectory.Ts_world_body, run(part, config)[1].trajectory.Ts_world_body
+    )
 
 
 def test_frames_of_a_keyframe_that_went_stay_where_they_were(rounds):
@@ -354,3 +366,32 @@ def test_what_flow_adds_of_a_camera_that_stands_still_goes_again(still, sensors)
     sizes, _ = sizes_of(still, tracker(sensors, "flow"))
     assert sizes[-1, 0] <= 1 + KEPT
     assert sizes[-1, 1] < 1.2 * sizes[0, 1]
+
+
+def num_doubled(m):
+    """Count the keypoints that are two landmarks at once."""
+    rows = [m.observations_of(k)[1] for k in m.keyframe_ids.tolist()]
+    return sum(len(r) - len(np.unique(r)) for r in rows)
+
+
+def num_unseen(m):
+    """Count the landmarks that no keyframe sees."""
+    return int(np.sum(m.count_observers(m.landmark_ids) == 0))
+
+
+@pytest.mark.parametrize("how", ["features", "flow"])
+@pytest.mark.parametrize("sensors", ["stereo", "mono", "rgbd"])
+def test_a_place_walked_round_again_and_again_does_not_grow_the_map(rounds, sensors, how):
+    sizes, result = sizes_of(rounds, tracker(sensors, how))
+    two, four = sizes[2 * PER_ROUND - 1], sizes[-1]
+    assert (four <= 1.3 * two).all(), f"keyframes, landmarks: {two} after 2 rounds, {four} after 4"
+    align = "se3" if result.is_metric else "sim3"
+    assert ate(result.trajectory, rounds.truth, align).rmse < 0.02
+
+
+@pytest.mark.parametrize("how", ["features", "flow"])
+@pytest.mark.parametrize("sensors", ["stereo", "mono", "rgbd"])
+def test_every_landmark_is_seen_and_no_keypoint_is_two(rounds, sensors, how):
+    slam, _ = run(rounds.part(0, 2 * PER_ROUND), tracker(sensors, how))
+    assert num_unseen(slam.map) == 0
+    assert num_doubled(slam.map) == 0

@@ -90,11 +90,12 @@ class Config:
 
 
 def _stereo() -> Config:
-    return Config()
+    return Config(threads=ThreadConfig(mapping_delay=3))
 
 
 def _mono() -> Config:
     return Config(
+        orb=OrbConfig(levels=5),
         tracking=TrackingConfig(sensors="mono"),
         bundle=BundleConfig(iterations=8),
     )
@@ -104,9 +105,11 @@ def _rgbd() -> Config:
     # Cameras with a depth image are held by hand, blur, and expose row after row: points are where
     # the model of one instant says only to a pixel or so, and depth is that of another instant.
     return Config(
+        orb=OrbConfig(count=600),
         tracking=TrackingConfig(sensors="rgbd", keyframe_ratio=0.93),
         noise=NoiseConfig(feature_px=1.0),
         depth=DepthConfig(noise=0.003),
+        threads=ThreadConfig(mapping_delay=3),
     )
 
 
@@ -140,9 +143,6 @@ PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
         "stereo-flow": _stereo_flow,
         "mono-flow": _mono_flow,
         "rgbd-flow": _rgbd_flow,
-        "stereo-orb": _stereo,
-        "mono-orb": _mono,
-        "rgbd-orb": _rgbd,
     }
 )
 """Named configurations: stereo, mono and rgbd, and the same with optical flow, for speed."""

@@ -37,13 +37,13 @@ Mask = NDArray[np.bool_]
 class CullConfig:
     """What goes from the map."""
 
-    redundant: Fraction = 0.9
+    redundant: Fraction = 0.7
     """Part of a keyframe's landmarks that others must see as well for it to go."""
     observers: Count = 3
     """Other keyframes that must see a landmark as well."""
     keyframes: Count = 2
     """Keyframes that may go at a time."""
-    min_found: Fraction = 0.25
+    min_found: Fraction = 0.1
     """Part of the frames that expected a landmark in which it must be found."""
     min_age: NotNegative = 2
     """Keyframes after its making from which on a landmark must have its observers."""

@@ -45,12 +45,14 @@ class DepthBias:
         self.value = np.zeros(3)
 
     def learn(self, solution: BundleSolution, share: float) -> None:
-        """Take in what a window says.
+        """Take in what a window says, if it has been solved to the end.
 
         Args:
             solution: of the window, with this bias removed.
             share: part of its observations that no window before has had.
         """
+        if solution.reason != "converged":
+            return  # away from the minimum the gradient is also that of everything else
         keep = np.outer(self._learns, self._learns)
         H = np.where(keep, solution.disparity_curvature, 0.0)
         k = np.where(self._learns, solution.disparity_gradient, 0.0)

@@ -38,7 +38,7 @@ from odomap.system.culling import CullConfig, poor_landmarks, redundant_keyframe
 from odomap.system.depthbias import DepthBias
 from odomap.system.fusing import FuseConfig, Fusions, find_fusions, fused
 from odomap.system.localbundle import Adjusted, adjust_window, median_distance
-from odomap.system.localwindow import LocalWindow
+from odomap.system.localwindow import LocalWindow, by_id
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
 from odomap.vision.matching import MatchConfig
@@ -154,9 +154,9 @@ class LocalMapper:
         new = self._write_created(change, map)
         self._bias.learn(adjusted.solution, 1.0 / max(int((~change.window.is_fixed).sum()), 1))
         self._write_covariance(change, map)
+        map.cull_keyframes(keyframes[change.redundant])
         poor = self._poor(change, map, new)
         map.remove_landmarks(poor)
-        map.cull_keyframes(keyframes[change.redundant])
         self.counts.update(
             landmarks_created=len(new),
             landmarks_fused=len(fusions.gone),
@@ -184,12 +184,11 @@ class LocalMapper:
         if not held:  # nothing else is known: the oldest one ties it all
             held = [min(free)] if len(free) > 1 else near[:1]
             free = [k for k in free if k not in held]
-        # A snapshot tells the landmarks of those that are free.
-        snapshot = self._map.snapshot([*free, *near], held)
+        # All as if they were free: a snapshot tells the landmarks of those alone.
+        snapshot = self._map.snapshot([*free, *near, *held])
         is_fixed = ~np.isin(snapshot.keyframe_ids, free)
-        return replace(
-            snapshot, is_fixed=is_fixed, anchor_id=int(snapshot.keyframe_ids[is_fixed][-1])
-        )
+        anchor = int(snapshot.keyframe_ids[is_fixed][-1])
+        return replace(by_id(snapshot), is_fixed=is_fixed, anchor_id=anchor)
 
     def _near(self, keyframe_id: int, known: set[int]) -> list[int]:
         """Return keyframes that look at what a new one sees without sharing a landmark with it."""

@@ -9,7 +9,7 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, section VI.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
 from odomap.maps.keyframes import Keyframe
+from odomap.maps.snapshot import Snapshot
 from odomap.vision.features import Features
 
-__all__ = ["LocalWindow"]
+__all__ = ["LocalWindow", "by_id"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -98,3 +99,16 @@ class LocalWindow:
     def center(self, k: int) -> Array:
         """Return where in the world the camera of keyframe row k is, (3,)."""
         return np.asarray(self.Ts_world_camera[k, :3, 3])
+
+
+def by_id(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot with its landmarks in order of their ids, by which the map fuses them."""
+    order = np.argsort(snapshot.landmark_ids)
+    row = np.empty(len(order), np.int64)
+    row[order] = np.arange(len(order))
+    return replace(
+        snapshot,
+        landmark_ids=snapshot.landmark_ids[order],
+        points_world=snapshot.points_world[order],
+        obs_landmark=row[snapshot.obs_landmark],
+    )

@@ -37,7 +37,7 @@ class Located:
         rows: (n,) rows of the reference that were found in the image.
         pixels: (n, 2) where.
         inliers: (n,) bool, those that agree with the pose.
-        expected: how many landmarks were expected in the image.
+        expected_rows: (m,) rows of the reference that were expected in the image.
     """
 
     T_world_body: Array
@@ -45,7 +45,12 @@ class Located:
     rows: NDArray[np.int64]
     pixels: Array
     inliers: NDArray[np.bool_]
-    expected: int
+    expected_rows: NDArray[np.int64]
+
+    @property
+    def expected(self) -> int:
+        """How many landmarks were expected in the image."""
+        return len(self.expected_rows)
 
     @property
     def num_inliers(self) -> int:
@@ -107,7 +112,7 @@ class Locator:
             guess[rows],
             warp,
         )
-        rows, pixels = rows[found], pixels[found]
+        expected, rows, pixels = rows, rows[found], pixels[found]
         weights = self._weights(points_camera[rows], T_reference_camera, reference, rows)
         sightings = Sightings(
             points_world[rows], self._normalised(pixels), np.full(len(rows), np.nan), weights
@@ -124,7 +129,7 @@ class Locator:
             rows,
             pixels,
             solution.inliers & solution.converged,
-            int(found.size),
+            expected,
         )
 
     def _solve(self, T_world_body: Array, sightings: Sightings, iterations: int) -> MotionSolution:

@@ -86,7 +86,8 @@ class MapLocator:
         )
         rows, found = np.concatenate([rows, more]), np.concatenate([found, at])
         solution = self._settled(view, local, rows, found, solution.T_world_body)
-        return self._located(view, rows, found, solution, len(rows) - len(more) + around)
+        expected = np.concatenate([rows[: len(rows) - len(more)], around])
+        return self._located(view, rows, found, solution, expected)
 
     def _search_for(
         self,
@@ -97,8 +98,8 @@ class MapLocator:
         T_world_body: Array,
         radius_px: float,
         claimed: Index | None = None,
-    ) -> tuple[Index, Index, int]:
-        """Match landmarks to features; return rows, features, and how many were expected."""
+    ) -> tuple[Index, Index, Index]:
+        """Match landmarks to features; return rows, features, and the rows that were expected."""
         T_camera_world = self._T_camera_body @ se3_inverse(T_world_body)
         scale, levels = self._orb.scale, self._orb.levels
         there = expect(local, rows, T_camera_world, self._camera, scale, levels)
@@ -119,7 +120,7 @@ class MapLocator:
             is_free = np.ones(len(view.descriptors), np.bool_)
             is_free[claimed] = False
             matched &= is_free[index]
-        return there.rows[matched], index[matched], len(there.rows)
+        return there.rows[matched], index[matched], there.rows
 
     def _settled(
         self, view: View, local: LocalMap, rows: Index, found: Index, T_world_body: Array
@@ -171,7 +172,7 @@ class MapLocator:
         )
 
     def _located(
-        self, view: View, rows: Index, found: Index, solution: MotionSolution, expected: int
+        self, view: View, rows: Index, found: Index, solution: MotionSolution, expected: Index
     ) -> Located:
         return Located(
             solution.T_world_body,

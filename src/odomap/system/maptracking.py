@@ -36,6 +36,8 @@ __all__ = ["MapTracker"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+FULLY = 0.9
+"""A frame that shows this part of what its keyframe showed adds nothing, however late it comes."""
 STILL = 0.005
 """A camera whose landmarks moved by less than this part of the image has seen nothing new."""
 
@@ -183,6 +185,7 @@ class MapTracker(Tracker[LocalMap]):
         estimate = super()._accept(look, known, located, status)
         if not estimate.is_keyframe:
             self._shown = shown
+            self._expected_often.append(known.landmark_ids[located.expected_rows])
             self._seen_often.append(shown)
             nearest = int(self._map.observing(shown)[0][0])
             if nearest != known.keyframe_id:
@@ -195,11 +198,12 @@ class MapTracker(Tracker[LocalMap]):
         config = self._config.tracking
         if not self._is_mapping:
             return False
+        shown = located.num_inliers / max(self._first_count, 1)
+        if shown < config.keyframe_ratio:
+            return True
         motion = self._motion_px(known, located) / self._eye.camera.width
-        return bool(
-            (self._since_keyframe >= config.keyframe_interval and motion > STILL)
-            or located.num_inliers < config.keyframe_ratio * self._first_count
-        )
+        is_due = self._since_keyframe >= config.keyframe_interval
+        return is_due and motion > STILL and shown < FULLY
 
     def _missing(self, frame: Frame) -> str:
         return self._keyframes.missing(frame)
