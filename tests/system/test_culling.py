@@ -9,7 +9,7 @@ from odomap.errors import ConfigError
 from odomap.system.culling import CullConfig, poor_landmarks, redundant_keyframes
 from windowworlds import circle, keep_observations, row, world
 
-CONFIG = CullConfig(keyframes=10)
+CONFIG = CullConfig(keyframes=10, redundant=0.9, min_found=0.25)
 
 
 def with_levels(window, level_of):
