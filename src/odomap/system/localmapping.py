@@ -48,6 +48,8 @@ __all__ = ["LocalChange", "LocalJob", "LocalMapper", "MappingConfig", "MappingSe
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+UNSURE_PX = 20.0
+"""Where landmarks may lie further off than this, what is found nearby would be something else."""
 KEPT = 3
 """Newest keyframes that are never culled: frames still hang from them."""
 
@@ -139,8 +141,7 @@ class LocalMapper:
         snapshot = self._snapshot(keyframe.id)
         if snapshot is None:
             return None
-        fixed = snapshot.keyframe_ids[snapshot.is_fixed]
-        anchor = self._anchor(keyframe.id, fixed)
+        anchor = self._anchor(keyframe.id, snapshot.keyframe_ids[snapshot.is_fixed])
         window = self._window(snapshot, keyframe.id)
         return LocalJob(self, self._sections, window, snapshot, anchor, self._drift(anchor))
 
@@ -196,10 +197,19 @@ class LocalMapper:
         if not config.near:
             return []
         T_world_body = self._map.T_world_body(keyframe_id)
-        points = self._map.points_world(self._map.observations_of(keyframe_id)[0])
-        radius = config.near_distance * median_distance(points, T_world_body[:3, 3])
+        seen, _ = self._map.observations_of(keyframe_id)
+        distance = median_distance(self._map.points_world(seen), T_world_body[:3, 3])
+        if not self._unsure_px(keyframe_id, distance) < UNSURE_PX:
+            return []
+        radius = config.near_distance * distance
         near = self._map.near(T_world_body, radius, np.radians(config.near_angle_deg))
         return [k for k in near.tolist() if k not in known][: config.near]
+
+    def _unsure_px(self, keyframe_id: int, distance: float) -> float:
+        """Return by how many pixels landmarks so far away may lie elsewhere than a pose says."""
+        sigma = np.sqrt(np.diag(self._map.covariance(keyframe_id)))
+        across = sigma[:3].max() / distance + sigma[3:].max()
+        return float(self._camera.fx * across)
 
     def _window(self, snapshot: Snapshot, keyframe_id: int) -> LocalWindow:
         ids = snapshot.landmark_ids

@@ -110,13 +110,16 @@ class MapTracker(Tracker[LocalMap]):
     def _turn_to(self, keyframe_id: int, T_world_body: Array) -> None:
         """Take the surroundings of a keyframe as the local map."""
         self._count()
-        self._due = None
+        self._due, self._epoch = None, self._map.epoch
+        self._local = self._around(keyframe_id, T_world_body)
+
+    def _around(self, keyframe_id: int, T_world_body: Array) -> LocalMap:
+        """Return the local map around a keyframe, or around the one that holds its stub."""
         alive = keyframe_id
         if not self._map.is_keyframe_alive(keyframe_id):
             alive = self._map.parent(keyframe_id)
         ranger = self._keyframes.ranger
-        self._epoch = self._map.epoch
-        self._local = local_map(
+        return local_map(
             self._map,
             alive,
             T_world_body,
@@ -173,14 +176,14 @@ class MapTracker(Tracker[LocalMap]):
         if isinstance(found, str):
             return found
         T_world_body = found.T_world_camera @ se3_inverse(self._eye.T_body_camera)
-        self._turn_to(found.keyframe_id, T_world_body)
-        assert self._local is not None
-        likely = self._local.rows_of(found.landmark_ids)
-        located = self._locator.locate(view, self._local, likely, T_world_body, 0)
-        return self._local, located
+        known = self._around(found.keyframe_id, T_world_body)
+        likely = known.rows_of(found.landmark_ids)
+        return known, self._locator.locate(view, known, likely, T_world_body, 0)
 
     def _accept(self, look: Look, known: LocalMap, located: Located, status: Status) -> Estimate:
         """Accept a frame, and turn to the keyframe that shares most landmarks with it."""
+        if known is not self._local:  # it was recognised there
+            self._local, self._due, self._epoch = known, None, self._map.epoch
         shown = known.landmark_ids[located.rows[located.inliers]]
         estimate = super()._accept(look, known, located, status)
         if not estimate.is_keyframe:
