@@ -19,7 +19,7 @@ from odomap.sources.open import open as open_source
 from odomap.system.slam import Slam
 
 FRAMES, MAPPED = 20, 12
-OVERRIDES = (("orb.count", "600"),)
+OVERRIDES = (("orb.count", "600"), ("threads.mapping_delay", "1"))
 
 
 @pytest.fixture(scope="module")

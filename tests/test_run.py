@@ -14,7 +14,7 @@ from odomap.geometry.pose import SE3
 from odomap.logbook import Logbook, peak_memory_mb, spread
 from odomap.maps.estimate import Estimate, Status
 from odomap.outputs import as_json
-from odomap.run import Interrupted, Progress, run
+from odomap.run import Interrupted, Progress, chosen_config, run
 from odomap.sensors.frame import Frame
 from odomap.sources.open import open as open_source
 from odomap.sources.source import Skipped
@@ -140,15 +140,27 @@ def test_interrupt_leaves_what_there_is_in_every_rhythm(world, tmp_path, rhythm)
     assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("odomap")]
 
 
-def test_lockstep_is_the_default_and_writes_the_bytes_of_inline(result, tmp_path):
+SAME = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap")
+
+
+def test_lockstep_is_the_default_and_writes_the_same_bytes_again(result, tmp_path):
     assert result.metrics["rhythm"] == "lockstep"
     assert "\nrhythm: lockstep\n" in (result.out / "config.yaml").read_text()
-    inline = run(WORLD, tmp_path, rhythm="inline")
-    assert inline.metrics["rhythm"] == "inline"
-    for name in ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap"):
-        assert (inline.out / name).read_bytes() == (result.out / name).read_bytes()
+    again = run(WORLD, tmp_path)
+    for name in SAME:
+        assert (again.out / name).read_bytes() == (result.out / name).read_bytes()
     for name in ("frames_dropped", "jobs_skipped", "messages_dropped"):
-        assert inline.metrics[name] == result.metrics[name] == 0
+        assert again.metrics[name] == result.metrics[name] == 0
+
+
+def test_with_a_delay_of_one_lockstep_writes_the_bytes_of_inline(tmp_path):
+    config = chosen_config("stereo", None, [("threads.mapping_delay", "1")])
+    for rhythm in ("inline", "lockstep"):
+        found = run(WORLD, tmp_path / rhythm, config=config, rhythm=rhythm)
+        assert found.metrics["rhythm"] == rhythm
+    for name in SAME:
+        inline, lockstep = (tmp_path / rhythm / name for rhythm in ("inline", "lockstep"))
+        assert inline.read_bytes() == lockstep.read_bytes()
 
 
 def test_live_counts_the_frames_that_it_drops(world, tmp_path):
