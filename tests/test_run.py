@@ -231,7 +231,7 @@ def test_a_source_without_frames_fails_with_a_reason(world, tmp_path):
 
 
 def test_config_changes_the_run(world, tmp_path):
-    (tmp_path / "c.yaml").write_text("features: {count: 150}\n")
+    (tmp_path / "c.yaml").write_text("orb: {count: 300}\n")
     few = run(world, config=tmp_path / "c.yaml", max_frames=4)
     many = run(world, max_frames=4)
     assert few.metrics["landmarks"] < many.metrics["landmarks"]
