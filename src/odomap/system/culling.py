@@ -19,11 +19,12 @@ T-RO 2015, sections VI-B and VI-E.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.limits import Count, Fraction, NotNegative, check_limits
+from odomap.limits import Count, Fraction, Limits, check_limits
 from odomap.system.localwindow import LocalWindow
 
 __all__ = ["CullConfig", "poor_landmarks", "redundant_keyframes"]
@@ -31,6 +32,10 @@ __all__ = ["CullConfig", "poor_landmarks", "redundant_keyframes"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+
+Age = Annotated[int, Limits(least=0)]
+"""How many keyframes ago."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,9 @@ class CullConfig:
     """Keyframes that may go at a time."""
     min_found: Fraction = 0.1
     """Part of the frames that expected a landmark in which it must be found."""
-    min_age: NotNegative = 2
+    min_age: Age = 2
     """Keyframes after its making from which on a landmark must have its observers."""
-    max_age: NotNegative = 3
+    max_age: Age = 3
     """Keyframes after its making until which a landmark is on probation."""
     min_observers: Count = 3
     """Keyframes that must see a landmark of a single camera."""
