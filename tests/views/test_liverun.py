@@ -95,6 +95,8 @@ def test_watched_or_not_the_files_are_the_same_bytes(viser, plain, tmp_path, vie
             over.set()
             visitor.join()
     assert len(came) > 1
+    if rhythm == "inline":
+        plain = run(world, tmp_path / "plain", rhythm=rhythm)
     for name in FILES:
         if name != "config.yaml" or rhythm == "lockstep":  # which says the rhythm
             assert (watched.out / name).read_bytes() == (plain.out / name).read_bytes(), name
