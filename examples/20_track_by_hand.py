@@ -3,11 +3,9 @@
 Run it with `python examples/20_track_by_hand.py`; docs/lesson/03_orb_slam.md explains it.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from odomap import SE3, Camera, Slam, open, preset
+from odomap import SE3, Camera, Slam, open
 from odomap.vision.orb import OrbConfig, OrbFeatures, extract
 
 
@@ -42,11 +40,10 @@ def refine(T: SE3, points: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, f:
 def main() -> None:
     source = open("sim:room?seed=4&frames=10&sensors=mono,depth&speed=3")
     *before, last = source
-    orb, camera = OrbConfig(count=1000), source.rig.cameras[0].camera
-    system = Slam(source.rig, replace(preset("rgbd"), orb=orb))  # for map and frame the same
+    system, camera = Slam(source.rig), source.rig.cameras[0].camera
     poses = [("as the frame before", [system.track(f).T_world_body for f in before][-1], 0)]
     views = system.map.views_of(system.map.landmark_ids, np.eye(4))
-    found = extract(last.images[0], orb)
+    found = extract(last.images[0], OrbConfig())
     pixels, sigma = found.keypoints - (camera.cx, camera.cy), 1.2 ** found.level.astype(float)
     for radius in (24.0, 12.0, 4.0):
         i, k = search(views, T := poses[-1][1], camera, found, radius).T

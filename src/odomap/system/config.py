@@ -106,6 +106,7 @@ def _rgbd() -> Config:
     # the model of one instant says only to a pixel or so, and depth is that of another instant.
     return Config(
         tracking=TrackingConfig(sensors="rgbd", keyframe_ratio=0.93),
+        bundle=BundleConfig(iterations=8),
         noise=NoiseConfig(feature_px=1.0),
         depth=DepthConfig(noise=0.003),
     )

@@ -79,6 +79,11 @@ class LocalMap:
         """(N,) ids, ascending."""
         return self.views.ids
 
+    @property
+    def num_seen(self) -> int:
+        """How many landmarks the keyframe sees."""
+        return int(np.count_nonzero(np.isfinite(self.keypoints[:, 0])))
+
     def __len__(self) -> int:
         return len(self.views.ids)
 

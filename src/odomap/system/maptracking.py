@@ -190,9 +190,9 @@ class MapTracker(Tracker[LocalMap]):
             self._shown = shown
             self._expected_often.append(known.landmark_ids[located.expected_rows])
             self._seen_often.append(shown)
-            nearest = int(self._map.observing(shown)[0][0])
-            if nearest != known.keyframe_id:
-                self._turn_later(nearest, located.T_world_body)
+            sharing, _ = self._map.observing(shown)
+            if len(sharing) and sharing[0] != known.keyframe_id:
+                self._turn_later(int(sharing[0]), located.T_world_body)
         return estimate
 
     # ---- keyframes ----
@@ -201,7 +201,8 @@ class MapTracker(Tracker[LocalMap]):
         config = self._config.tracking
         if not self._is_mapping:
             return False
-        shown = located.num_inliers / max(self._first_count, 1)
+        # Of a place seen before as much is wanted as was seen there, not as at the last keyframe.
+        shown = located.num_inliers / max(min(self._first_count, known.num_seen), 1)
         if shown < config.keyframe_ratio:
             return True
         motion = self._motion_px(known, located) / self._eye.camera.width
