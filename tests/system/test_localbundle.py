@@ -8,7 +8,8 @@ import pytest
 from odomap.backend.bundle import BundleConfig
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.system.creating import CreateConfig, Created, create_landmarks
-from odomap.system.localbundle import adjust_window, median_distance
+from odomap.system.localbundle import adjust_window
+from odomap.system.localmap import median_distance
 from odomap.vision.matching import MatchConfig
 from windowworlds import CAMERA, circle, keep_observations, row, with_features, world
 

@@ -17,10 +17,11 @@ from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bu
 from odomap.geometry.lie import se3_inverse
 from odomap.system.creating import Created
 from odomap.system.depthbias import bias_at
+from odomap.system.localmap import median_distance
 from odomap.system.localwindow import LocalWindow
 from odomap.system.ranging import UNIT_BASELINE
 
-__all__ = ["Adjusted", "adjust_window", "median_distance"]
+__all__ = ["Adjusted", "adjust_window", "at_one_place"]
 
 Array = NDArray[np.float64]
 
@@ -80,7 +81,8 @@ def adjust_window(
     xy, inverse_depth, weights = _measured(window, keyframe, keypoint)
     points = np.concatenate([window.points_world[kept], created.points_world])
     has_depth = bool(np.isfinite(inverse_depth).any())
-    free = not has_depth and _at_one_place(window, Ts_world_body, points)
+    sigma = window.sigma_px / window.camera.fx
+    free = not has_depth and at_one_place(Ts_world_body[window.is_fixed], points, sigma)
     solution = solve_bundle(
         Bundle(
             Ts_world_body,
@@ -129,19 +131,17 @@ def _measured(
     return xy, inverse_depth, 1.0 / np.stack([sigma, depth], axis=1)
 
 
-def _at_one_place(window: LocalWindow, Ts_world_body: Array, points_world: Array) -> bool:
-    """Say whether the fixed keyframes are too near to each other to tell how large a scene is.
+def at_one_place(Ts_world_fixed: Array, points_world: Array, sigma: float) -> bool:
+    """Say whether fixed keyframes are too near to each other to tell how large a scene is.
 
     One alone is, and so are two of a camera that stood still: their parallax is lost in the
     noise of a point.
+
+    Args:
+        Ts_world_fixed: (F, 4, 4) poses that are held.
+        points_world: (M, 3) the scene.
+        sigma: noise of a point in normalised image coordinates.
     """
-    fixed = Ts_world_body[window.is_fixed][:, :3, 3]
-    sigma = window.sigma_px / window.camera.fx
+    fixed = Ts_world_fixed[:, :3, 3]
     apart = np.linalg.norm(fixed - fixed[-1], axis=1).max()
     return bool(apart < sigma * median_distance(points_world, fixed[-1]))
-
-
-def median_distance(points_world: Array, from_world: Array) -> float:
-    """Return how far points (N, 3) typically are from another; 1 if there are none."""
-    away = np.linalg.norm(points_world - from_world, axis=1)
-    return float(np.median(away)) if len(away) else 1.0

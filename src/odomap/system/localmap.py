@@ -24,7 +24,15 @@ from odomap.maps.views import LandmarkViews
 from odomap.system.dispute import SETTLED
 from odomap.system.maplocating_kernels import foresee
 
-__all__ = ["Expected", "LocalMap", "LocalMapConfig", "expect", "local_map"]
+__all__ = [
+    "Expected",
+    "LocalMap",
+    "LocalMapConfig",
+    "expect",
+    "local_map",
+    "median_distance",
+    "nearby",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -97,6 +105,25 @@ class LocalMap:
         return np.flatnonzero(is_here)
 
 
+def nearby(map: Map, T_world_body: Array, distance: float, config: LocalMapConfig) -> Index:
+    """Return keyframes that look at the same place as a body does, nearest first.
+
+    Args:
+        map: what is remembered.
+        T_world_body: (4, 4) where the body is.
+        distance: of what it sees, world units.
+        config: how near they must be.
+    """
+    radius = config.near_distance * distance
+    return map.near(T_world_body, radius, np.radians(config.near_angle_deg))
+
+
+def median_distance(points_world: Array, from_world: Array) -> float:
+    """Return how far points (N, 3) typically are from another; 1 if there are none."""
+    away = np.linalg.norm(points_world - from_world, axis=1)
+    return float(np.median(away)) if len(away) else 1.0
+
+
 def local_map(
     map: Map,
     keyframe_id: int,
@@ -118,9 +145,7 @@ def local_map(
     seen, rows = map.observations_of(keyframe_id)
     sharing = map.observing(seen)[0][: config.keyframes]
     points = map.points_world(seen)
-    away = np.linalg.norm(points - T_world_body[:3, 3], axis=1)
-    radius = config.near_distance * float(np.median(away)) if len(away) else 0.0
-    near = map.near(T_world_body, radius, np.radians(config.near_angle_deg))
+    near = nearby(map, T_world_body, median_distance(points, T_world_body[:3, 3]), config)
     near = near[~np.isin(near, sharing)][: config.near]
     ids = map.landmarks_of(np.concatenate([sharing, near, [keyframe_id]]))
     views = map.views_of(ids, T_body_camera)

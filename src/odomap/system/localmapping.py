@@ -21,7 +21,6 @@ T-RO 2015, section VI.
 
 from collections import Counter, deque
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleConfig
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
-from odomap.limits import Count, Limits, NotNegative, Positive, check_limits
+from odomap.limits import Count, Positive, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
@@ -37,7 +36,8 @@ from odomap.system.creating import CreateConfig, Created, create_landmarks
 from odomap.system.culling import CullConfig, poor_landmarks, redundant_keyframes
 from odomap.system.depthbias import DepthBias
 from odomap.system.fusing import FuseConfig, Fusions, find_fusions, fused
-from odomap.system.localbundle import Adjusted, adjust_window, median_distance
+from odomap.system.localbundle import Adjusted, adjust_window
+from odomap.system.localmap import LocalMapConfig, median_distance, nearby
 from odomap.system.localwindow import LocalWindow, by_id
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
@@ -64,12 +64,6 @@ class MappingConfig:
     """Further keyframes that see the same landmarks, and hold them in place."""
     min_shared: Count = 15
     """Landmarks that a keyframe must share with the new one to be adjusted with it."""
-    near: Annotated[int, Limits(least=0)] = 5
-    """Keyframes that share nothing with the new one but look at the same place from nearby."""
-    near_distance: NotNegative = 0.3
-    """How near those are, as a fraction of the median distance of landmarks."""
-    near_angle_deg: NotNegative = 30.0
-    """How much their directions of view may differ."""
     gate: Positive = 3.5
     """Residual, in standard deviations, beyond which an observation is dropped."""
 
@@ -87,6 +81,7 @@ class MappingSections:
     """
 
     mapping: MappingConfig
+    local: LocalMapConfig
     creating: CreateConfig
     fusing: FuseConfig
     culling: CullConfig
@@ -193,16 +188,13 @@ class LocalMapper:
 
     def _near(self, keyframe_id: int, known: set[int]) -> list[int]:
         """Return keyframes that look at what a new one sees without sharing a landmark with it."""
-        config = self._sections.mapping
-        if not config.near:
-            return []
+        config = self._sections.local
         T_world_body = self._map.T_world_body(keyframe_id)
         seen, _ = self._map.observations_of(keyframe_id)
         distance = median_distance(self._map.points_world(seen), T_world_body[:3, 3])
         if not self._unsure_px(keyframe_id, distance) < UNSURE_PX:
             return []
-        radius = config.near_distance * distance
-        near = self._map.near(T_world_body, radius, np.radians(config.near_angle_deg))
+        near = nearby(self._map, T_world_body, distance, config)
         return [k for k in near.tolist() if k not in known][: config.near]
 
     def _unsure_px(self, keyframe_id: int, distance: float) -> float:

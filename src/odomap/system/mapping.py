@@ -24,6 +24,8 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.system.depthbias import DepthBias, bias_at
+from odomap.system.localbundle import at_one_place
+from odomap.system.localmap import median_distance
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
@@ -158,25 +160,12 @@ class WindowMapper:
             inverse_depth,
             np.tile(self._weights, (len(xy), 1)),
             is_scale_free=not np.isfinite(inverse_depth).any()
-            and _at_one_place(snapshot, 1.0 / float(self._weights[0])),
+            and at_one_place(
+                snapshot.Ts_world_body[snapshot.is_fixed],
+                snapshot.points_world,
+                1.0 / float(self._weights[0]),
+            ),
         )
-
-
-def _at_one_place(snapshot: Snapshot, sigma: float) -> bool:
-    """Say whether the fixed keyframes are too near to each other to tell how large a scene is.
-
-    One alone is, and so are two of a camera that stood still: their parallax is lost in the
-    noise of a point, `sigma` in normalised image coordinates.
-    """
-    fixed = snapshot.Ts_world_body[snapshot.is_fixed][:, :3, 3]
-    depth = _median_distance(snapshot.points_world, fixed[-1])
-    return bool(np.linalg.norm(fixed - fixed[-1], axis=1).max() < sigma * depth)
-
-
-def _median_distance(points_world: Array, from_world: Array) -> float:
-    """Return how far points (N, 3) typically are from another; 1 if there are none."""
-    away = np.linalg.norm(points_world - from_world, axis=1)
-    return float(np.median(away)) if len(away) else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +202,7 @@ class WindowJob:
         Ts = solution.Ts_world_body
         T_newest_anchor = se3_inverse(Ts[newest]) @ Ts[anchor]
         measured = self.bundle.is_scale_free or np.isfinite(self.bundle.disparity).any()
-        depth = None if measured else _median_distance(solution.points_world, Ts[newest, :3, 3])
+        depth = None if measured else median_distance(solution.points_world, Ts[newest, :3, 3])
         drift = self.anchor_drift.onwards(T_newest_anchor, solution, newest, self.overlap, depth)
         newest_id = int(self.snapshot.keyframe_ids[newest])
         return WindowChange(self.mapper, update, newest_id, drift, self.leaving, solution)

@@ -114,6 +114,7 @@ def _sections(config: Config) -> MappingSections:
     noise = config.noise
     return MappingSections(
         config.mapping,
+        config.local,
         config.creating,
         config.fusing,
         config.culling,
