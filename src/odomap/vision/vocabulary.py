@@ -18,6 +18,7 @@ sequences", T-RO 28(5), 2012; Nistér, Stewénius, "Scalable recognition with a 
 CVPR 2006.
 """
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -171,6 +172,14 @@ class VocabularyTree:
     def num_words(self) -> int:
         """How many words there are."""
         return int((self.num_children == 0).sum())
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """What tells this vocabulary from others; words of two are not to be compared."""
+        digest = hashlib.sha256(self.centres.tobytes())
+        digest.update(self.num_children.astype("<i8").tobytes())
+        digest.update(self.weights.astype("<f4").tobytes())
+        return digest.hexdigest()[:16]
 
     @cached_property
     def first_child(self) -> Index:
