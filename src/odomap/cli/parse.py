@@ -23,6 +23,7 @@ from odomap.cli.localize import Continue, Localize
 from odomap.cli.optimize import Optimize
 from odomap.cli.run import Run
 from odomap.cli.view import ViewVerb
+from odomap.cli.vocabulary import VocabularyVerb
 from odomap.errors import InputError, nearest_name
 from odomap.version import __version__
 
@@ -38,6 +39,7 @@ VERBS: dict[str, Any] = {
     "optimize": Optimize,
     "bundle": Bundle,
     "export": Export,
+    "vocabulary": VocabularyVerb,
     "info": Info,
     "view": ViewVerb,
     "config": ConfigVerb,
