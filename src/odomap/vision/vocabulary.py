@@ -40,8 +40,9 @@ Index = NDArray[np.int64]
 LEAST_BRANCHING, MOST_BRANCHING, MOST_DEPTH = 2, 255, 16
 MOST_NODES = 1 << 22
 """More nodes than any vocabulary in use has; their centres take 128 MB."""
-DIRECT_LEVEL = 3
-"""Level of the direct index: a thousand nodes where ten branch, one feature or two in each."""
+DIRECT_LEVEL = 1
+"""Level of the direct index: of what all pairs would match, four fifths share a node of the first
+level, half of the second, a third of the third."""
 
 
 @dataclass(frozen=True, eq=False)
