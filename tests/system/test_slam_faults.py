@@ -39,7 +39,7 @@ TOLD = {
 }
 """The faults that tell something of each; `benchmarks/faults.py` has all for all."""
 
-OUTVOTED = "a board that fills a third of the view has nearly all features: the pose goes with it"
+OUTVOTED = "a board comes in where nothing is known yet: a few points on it pull the pose along"
 
 
 def cases():
@@ -84,9 +84,15 @@ def plainer():
     return Recordings(seed=5)
 
 
-@pytest.mark.xfail(reason=OUTVOTED, strict=True)
-@pytest.mark.parametrize("fault", OBJECTS)
-@pytest.mark.parametrize("sensors", ["stereo", "rgbd"])
+def boards():
+    for sensors in ("stereo", "rgbd"):
+        for fault in OBJECTS:
+            outvoted = sensors == "rgbd" and fault != "object coming along"
+            marks = [pytest.mark.xfail(reason=OUTVOTED, strict=True)] if outvoted else []
+            yield pytest.param(sensors, fault, marks=marks)
+
+
+@pytest.mark.parametrize(("sensors", "fault"), list(boards()))
 def test_a_thing_that_moves_is_not_taken_for_the_world(plainer, sensors, fault):
     source = plainer.disturbed(sensors, fault)
     system = Slam(source.rig)

@@ -31,9 +31,11 @@ from odomap.sensors.frame import Frame
 from odomap.system.association import Association, TrackingConfig, View
 from odomap.system.dispute import FEWEST, SETTLED
 from odomap.system.eye import Eye
+from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located
 from odomap.system.path import Path, Placed
 from odomap.system.starting import Start, Started, Waiting
+from odomap.system.veil import VEILED, Veil
 from odomap.vision.turning import Thumbnail, turn_between
 
 __all__ = ["Clock", "Known", "Look", "Tracker"]
@@ -106,11 +108,15 @@ class Tracker(ABC, Generic[K]):
         path: the frames placed so far.
     """
 
+    _keyframes: Keyframes
+    """What makes keyframes: each tracker has its own."""
+
     def __init__(
         self, map: Map, eye: Eye, association: Association, start: Start, config: TrackingConfig
     ) -> None:
         self._map, self._eye, self._association = map, eye, association
         self._start, self._tracking = start, config
+        self._veil = Veil(map, eye)
         self._last: View | None = None
         self._raw: NDArray[np.uint8] | None = None
         self._newest_ns = -1
@@ -169,7 +175,8 @@ class Tracker(ABC, Generic[K]):
         clock.lap("track")
         if located.num_inliers >= self._tracking.min_inliers:
             return self._accept(look, known, located, status)
-        if self._lost >= self._tracking.patience and self._may_start_anew():
+        is_patient = self._lost < self._tracking.patience or self._veil.is_shown(look.view)
+        if not is_patient and self._may_start_anew():
             return self._begin(look)
         return self._lose(frame, _why_lost(located, self._tracking.min_inliers, look.view), clock)
 
@@ -238,6 +245,10 @@ class Tracker(ABC, Generic[K]):
         reason, is_keyframe = "", self._wants_keyframe(known, located)
         if is_keyframe and (missing := self._missing(look.frame)):
             reason, is_keyframe = f"{missing}: no keyframe", False
+        if is_keyframe and self._veil.hides(
+            look.frame, look.view, known.landmark_ids, located, self._keyframes.ranger
+        ):
+            reason, is_keyframe = f"{VEILED}: no keyframe", False
         if is_keyframe:
             keyframe_id = self._make_keyframe(look, known, located, placed)
             placed = Placed(placed.stamp_ns, keyframe_id, np.eye(4), np.zeros((6, 6)))
