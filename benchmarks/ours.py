@@ -78,7 +78,7 @@ def play(options: argparse.Namespace) -> None:
             time.sleep(max(0.0, due - time.perf_counter()))
         estimate = meter.call(system.track, frame)
         statuses.append(estimate.status)
-        stall_ms.append(estimate.timing.get("map", 0.0))
+        stall_ms.append(estimate.timing.get("wait", estimate.timing.get("map", 0.0)))
     trajectory = system.finish().trajectory
     write_tum(Path(f"{options.prefix}.tum"), trajectory)
     told = {"lost": lost(statuses), "stall_ms": stall_ms}

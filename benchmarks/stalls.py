@@ -229,7 +229,7 @@ def run(source: Source, config: Config, rhythm: str, frames: int = 0, paced: boo
         timing = system.track(frame).timing
         # In lockstep a job that is due is collected before the frame is placed.
         is_beside.append(was_solving and rhythm == "live")
-        stalls.append(timing.get("map", 0.0))
+        stalls.append(timing["wait"])
         placing.append(timing.get("prepare", 0.0) + timing.get("track", 0.0))
     system.finish()
     return summary(lock, np.array(stalls), np.array(placing), np.array(is_beside), parts)

@@ -151,6 +151,10 @@ def test_lockstep_is_the_default_and_writes_the_same_bytes_again(result, tmp_pat
         assert (again.out / name).read_bytes() == (result.out / name).read_bytes()
     for name in ("frames_dropped", "jobs_skipped", "messages_dropped"):
         assert again.metrics[name] == result.metrics[name] == 0
+    beside = result.metrics["beside_ms"]
+    assert set(beside) == {"keyframe", "map reads", "map solves", "map writes"}
+    assert beside["map solves"]["count"] == beside["map writes"]["count"] >= 1
+    assert "Beside the frames" in (result.out / "report.html").read_text()
 
 
 def test_with_a_delay_of_one_lockstep_writes_the_bytes_of_inline(tmp_path):

@@ -25,7 +25,7 @@ from odomap.choice import SystemChoice
 from odomap.errors import CalibrationError, InputError
 from odomap.figures import figures
 from odomap.geometry.trajectory import Trajectory
-from odomap.logbook import Logbook
+from odomap.logbook import Logbook, spread
 from odomap.maps.estimate import Estimate
 from odomap.settings import override, read_config
 
@@ -187,7 +187,7 @@ def run(
             raise CalibrationError(f"{head['data']}: {error}") from error
         result = system.finish()
         state: dict[str, object] = {"compile_s": compile_s, "interrupted": interrupt.is_set()}
-        state |= {"rhythm": rhythm, "is_mapping": is_mapping} | _dropped(system.worker)
+        state |= {"rhythm": rhythm, "is_mapping": is_mapping} | _beside(system.worker)
         if broken is not None:
             state["failure"] = f"tracking stopped: {broken}"
         finished = _concluded(source, logbook, result, outputs, state, tell)
@@ -293,9 +293,12 @@ def _track(
     return None
 
 
-def _dropped(worker: "Worker") -> dict[str, object]:
-    """Return what a worker left out to keep up; nothing unless live."""
+def _beside(worker: "Worker") -> dict[str, object]:
+    """Return what a worker left out to keep up, nothing unless live, and what ran beside frames."""
     return {
+        "beside_ms": {
+            name: {"count": len(ms), **spread(ms)} for name, ms in worker.beside_ms.items()
+        },
         "frames_dropped": worker.frames_dropped,
         "jobs_skipped": worker.jobs_skipped,
         "messages_dropped": worker.messages_dropped,

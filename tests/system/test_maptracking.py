@@ -52,9 +52,9 @@ def test_a_second_round_hangs_from_the_first(loop):
     slam = Slam(loop.rig, preset("stereo"))
     estimates = track(slam, loop)
     assert {e.status for e in estimates} <= {Status.TRACKING, Status.RECOVERED}
-    made = [e.keyframe_id for e in estimates[:PER_ROUND] if e.is_keyframe]
+    made = [e.stamp_ns for e in estimates[:PER_ROUND] if e.is_keyframe]
     again = estimates[PER_ROUND:]
-    old = [e.keyframe_id in made for e in again]
+    old = [e.keyframe_id < len(made) for e in again]
     assert np.mean(old) > 0.5
     assert sum(e.is_keyframe for e in again) < 0.5 * len(made)
     # So the drift does not go on: the second round is as good as the first.
@@ -67,12 +67,10 @@ def test_frames_hang_from_keyframes_that_came_before(loop):
     estimates = track(slam, loop.part(0, PER_ROUND))
     m = slam.map
     for n, e in enumerate(estimates):
-        if e.is_keyframe:
-            assert m.keyframe(e.keyframe_id).stamp_ns == e.stamp_ns
-            np.testing.assert_array_equal(e.T_keyframe_body.matrix, np.eye(4))
-        else:
-            hung = int(np.searchsorted(loop.stamps_ns, m.keyframe(e.keyframe_id).stamp_ns))
-            assert hung < n
+        hung = int(np.searchsorted(loop.stamps_ns, m.keyframe(e.keyframe_id).stamp_ns))
+        assert hung < max(n, 1)
+    stamps = {m.keyframe(k).stamp_ns for k in m.keyframe_ids.tolist()}
+    assert stamps <= {e.stamp_ns for e in estimates if e.is_keyframe}
 
 
 def test_keyframes_are_made_where_something_new_is_seen(loop):

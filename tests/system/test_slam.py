@@ -121,8 +121,6 @@ def test_estimates_hold_together(world, runs, name):
     placed = [e for e in estimates if e.status is Status.TRACKING]
     for frame, e in zip(world, estimates):
         assert (e.frame_id, e.stamp_ns) == (frame.id, frame.stamp_ns)
-        if e.is_keyframe:
-            np.testing.assert_array_equal(e.T_keyframe_body.matrix, np.eye(4))
     live = result.trajectory_live
     emitted = np.array([e.T_world_body.matrix for e in placed])
     np.testing.assert_allclose(live.Ts_world_body, emitted, atol=1e-12)
@@ -142,9 +140,11 @@ def test_estimates_hold_together(world, runs, name):
 def test_frames_hang_from_keyframes_that_were_there(runs, name):
     """A frame may hang from an old keyframe; it may well be culled later, and is placed still."""
     estimates, result, _ = runs(name)
-    made = {e.keyframe_id for e in estimates if e.is_keyframe}
-    used = {e.keyframe_id for e in estimates if e.status is Status.TRACKING}
-    assert used <= made | {0, 1}
+    seen = np.maximum.accumulate([e.keyframe_id for e in estimates])
+    begun = np.cumsum([e.is_keyframe for e in estimates])  # mono starts with two at once
+    used = [e.keyframe_id for e in estimates if e.status is Status.TRACKING]
+    assert min(used) >= 0
+    assert (seen <= begun).all()
     assert np.isfinite(result.trajectory.Ts_world_body).all()
 
 

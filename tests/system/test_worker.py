@@ -25,15 +25,16 @@ class Track:
 
     def __init__(self, map, log, during=None):
         self.map, self.log, self.during = map, log, during
+        self.wanted = None
+
+    def prepare(self, frame):
+        return frame
 
     def track(self, frame):
         self.log.append(("track", frame.id))
-        is_keyframe = frame.id % 3 == 0
         T = np.eye(4)
         T[0, 3] = frame.id
-        if is_keyframe:
-            k = self.map.new_keyframe_id()
-            self.map.add_keyframe(Keyframe(k, frame.stamp_ns), T)
+        self.wanted = (frame, T) if frame.id % 3 == 0 else None
         if self.during is not None:
             self.during(frame)
         self.log.append(("tracked", frame.id))
@@ -42,12 +43,20 @@ class Track:
             stamp_ns=frame.stamp_ns,
             status=Status.TRACKING,
             reason="",
-            keyframe_id=int(self.map.keyframe_ids[-1]),
+            keyframe_id=int(max(self.map.keyframe_ids, default=-1)),
             T_keyframe_body=SE3.identity(),
             T_world_body=SE3(T),
             covariance=np.eye(6),
-            is_keyframe=is_keyframe,
+            is_keyframe=self.wanted is not None,
         )
+
+    def make_keyframe(self):
+        if self.wanted is None:
+            return None
+        (frame, T), self.wanted = self.wanted, None
+        k = self.map.new_keyframe_id()
+        self.map.add_keyframe(Keyframe(k, frame.stamp_ns), T)
+        return self.map.keyframe(k)
 
 
 class Lift:

@@ -51,8 +51,9 @@ class Estimate:
         covariance: (6, 6) of T_world_body, tangent (translation, rotation), right update,
             metres and radians; relative to the first pose, which is exact.
         num_inliers: observations that agree with the pose.
-        is_keyframe: whether the frame became a keyframe.
-        timing: milliseconds per stage.
+        is_keyframe: whether the frame becomes a keyframe, which observers are told of when it is
+            made; but for the very first, its pose hangs from the one before as that of any frame.
+        timing: milliseconds per stage that this estimate had to wait for.
         tracks: the image points behind it.
     """
 

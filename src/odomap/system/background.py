@@ -1,10 +1,10 @@
 """Beside the tracker: a stage whose jobs are solved in a thread of its own, one at a time.
 
-What a stage reads from the map and what it writes to it runs in the thread of the tracker, between
-two frames, so that no frame sees the map change under its feet and every order of events is that
-of the code. Only what lies between, `Job.solve` on arrays that are its own, runs in the thread:
+What a stage reads from the map and what it writes to it runs between two frames (`parallel`), so
+that no frame sees the map change under its feet and every order of events is that of the code. Only
+what lies between, `Job.solve` on arrays that are its own, runs beside the frames:
 
-    tracker's thread   start (add reads) ──────── frames ────────▶ collect, change.write
+    between frames     start (add reads) ──────── frames ────────▶ collect, change.write
     stage's thread              └──── solve: compiled, without the GIL ────┘
 
 When to collect is all that the rhythms differ in. Python hands its lock from thread to thread every
@@ -16,13 +16,14 @@ Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR works
 
 import sys
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from odomap.limits import Count, Limits, check_limits
 from odomap.maps.keyframes import Keyframe
-from odomap.system.stages import Change, Closer, Mapper
+from odomap.system.stages import Change, Closer, Job, Mapper
 
 __all__ = ["Lane", "QuickSwitching", "ThreadConfig"]
 
@@ -96,11 +97,13 @@ class Lane:
     Attributes:
         name: of the lane.
         keyframe: the one whose job is out, or None.
+        solved_ms: milliseconds that the last job was solved in.
     """
 
     def __init__(self, name: str, stage: Mapper | Closer) -> None:
         self.name, self._stage = name, stage
         self.keyframe: Keyframe | None = None
+        self.solved_ms = 0.0
         self._future: Future[Change] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
@@ -129,8 +132,14 @@ class Lane:
             return False
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
-        self.keyframe, self._future = keyframe, self._thread.submit(job.solve)
+        self.keyframe, self._future = keyframe, self._thread.submit(self._solve, job)
         return True
+
+    def _solve(self, job: Job) -> Change:
+        start = time.perf_counter()
+        change = job.solve()
+        self.solved_ms = 1e3 * (time.perf_counter() - start)
+        return change
 
     def collect(self) -> tuple[Keyframe, Change]:
         """Wait for the job that is out.

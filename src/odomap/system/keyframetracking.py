@@ -20,10 +20,11 @@ from odomap.system.dispute import SETTLED
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located, Locator
+from odomap.system.looking import Look
 from odomap.system.path import Placed
 from odomap.system.relocalization import relocalize
 from odomap.system.starting import Start, Started
-from odomap.system.tracking import Look, Tracker
+from odomap.system.tracking import Tracker
 
 __all__ = ["KeyframeTracker"]
 

@@ -1,18 +1,19 @@
 """Lockstep: mapping and closing beside the tracker, with the same bytes on every run.
 
 A parallel run usually depends on which thread was faster. Here it cannot: the change of keyframe k
-is written exactly d frames later, before the tracker is given that frame, waiting if it is not
-solved yet. All reading and writing of the map is in the tracker's thread, at moments that are
-counted in frames, so that the path is a function of the frames and of d alone:
+is written exactly d frames later, before that frame is looked for in the map, waiting if it is not
+solved yet. The map is read and written by one thread at a time, in an order that is counted in
+frames, so that the path is a function of the frames and of d alone:
 
     frame  n   tracked, becomes keyframe k; its job is started
     frame  n+1 … n+d−1    tracked on the map as it was, while the job is solved
     frame  n+d            the change is written, then the frame is tracked
 
 With d = 1 every frame sees the map that it would see inline, and the job has the time in which the
-next frame is read; with d = 0 the rhythm is inline. A stage has one job out at most: where a
-keyframe comes before d frames are over, the change before it is written first, so that `add` reads
-a map which is known. The closer is given a keyframe when the mapper has written what it found.
+next frame is read and made ready; d = 0 is the same, with nothing beside the tracker. A stage has
+one job out at most: where a keyframe comes before d frames are over, the change before it is
+written first, so that `add` reads a map which is known. The closer is given a keyframe when the
+mapper has written what it found.
 
 Observers are called in the caller's thread. Timing per frame includes the waiting.
 
@@ -20,9 +21,7 @@ Reference: none in print; the idea is that of the synchronous languages (Benveni
 synchronous approach to reactive and real-time systems", 1991): a delay is a number of steps.
 """
 
-from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
-from odomap.sensors.frame import Frame
 from odomap.system.background import ThreadConfig
 from odomap.system.parallel import ParallelWorker
 from odomap.system.stages import Stages
@@ -46,10 +45,10 @@ class LockstepWorker(ParallelWorker):
         self._due = [0] * len(self._lanes)
         self._count = 0
 
-    def advance(self, frame: Frame) -> Estimate:
-        """Write what is due, waiting for it; track the frame; start what its keyframe asks for."""
+    def _write_due(self) -> None:
+        """Write what is due at the next frame, counted in the one order that there is."""
         self._count += 1
-        return super().advance(frame)
+        super()._write_due()
 
     def _is_due(self, index: int) -> bool:
         return self._due[index] <= self._count

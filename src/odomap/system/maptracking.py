@@ -25,11 +25,13 @@ from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.localmap import LocalMap, local_map
 from odomap.system.locating import Located
+from odomap.system.looking import Look
 from odomap.system.maplocating import MapLocator
 from odomap.system.path import Placed
 from odomap.system.recognition import Recognizer
+from odomap.system.revisiting import Passed
 from odomap.system.starting import Start, Started
-from odomap.system.tracking import Look, Tracker
+from odomap.system.tracking import Tracker
 
 __all__ = ["MapTracker"]
 
@@ -80,6 +82,7 @@ class MapTracker(Tracker[LocalMap]):
         self._shown = np.empty(0, np.int64)
         self._expected_often: list[Index] = []
         self._seen_often: list[Index] = []
+        self._passed = Passed(int(map.keyframe_ids.max(initial=-1)))
 
     # ---- the local map ----
 
@@ -105,6 +108,7 @@ class MapTracker(Tracker[LocalMap]):
         A new keyframe is no sooner there than the mapper changes what is around it.
         """
         self._count()
+        self._passed.add(keyframe_id)
         self._due, self._epoch = (keyframe_id, T_world_body), self._map.epoch
 
     def _turn_to(self, keyframe_id: int, T_world_body: Array) -> None:
@@ -204,10 +208,18 @@ class MapTracker(Tracker[LocalMap]):
         # Of a place seen before as much is wanted as was seen there, not as at the last keyframe.
         shown = located.num_inliers / max(min(self._first_count, known.num_seen), 1)
         if shown < config.keyframe_ratio:
-            return True
+            return not self._is_seen_before(known, located)
         motion = self._motion_px(known, located) / self._eye.camera.width
         is_due = self._since_keyframe >= config.keyframe_interval
-        return is_due and motion > STILL and shown < FULLY
+        is_due = is_due and motion > STILL and shown < FULLY
+        return is_due and not self._is_seen_before(known, located)
+
+    def _is_seen_before(self, known: LocalMap, located: Located) -> bool:
+        """Say whether the last view shows a place that the map knows already."""
+        assert self._last is not None
+        anchors = self._map.anchors(known.landmark_ids[located.rows[located.inliers]])
+        found, features = located.pixels[located.inliers], self._last.corners.keypoints
+        return self._passed.is_known(anchors, found, features, self._eye.camera.width)
 
     def _missing(self, frame: Frame) -> str:
         return self._keyframes.missing(frame)

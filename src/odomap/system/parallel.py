@@ -7,19 +7,30 @@ and in what becomes of a keyframe whose stage is busy:
     lockstep a fixed number of frames later           waits for the change before it
     live     at the first frame that finds it solved  waits in line; the newest replaces it
 
-Reading and writing of the map stay in the tracker's thread: a frame sees one map, from its first
-look at it to its last.
+The map belongs to one thread at a time. While a frame is tracked it is the tracker's: a frame sees
+one map, from its first look at it to its last. Between frames it is lent to a thread that writes
+what is due, makes the keyframe that was asked for and lets stages read; the caller has its estimate
+by then, and the next image is made ready meanwhile:
+
+    caller's thread   … track → estimate     wait for image, prepare      track → estimate …
+    between frames              └ make keyframe, add;  write what is due ┘
+    stage's thread                                └──── solve ────────────────────────▶
+
+Observers are told in the order of events, when the map is the tracker's again.
 """
 
 import time
 from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
 from odomap.system.background import Lane, QuickSwitching
-from odomap.system.stages import Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.worker import Worker
 
 __all__ = ["ParallelWorker"]
@@ -32,8 +43,10 @@ class ParallelWorker(Worker):
         super().__init__(stages)
         named = ("map", stages.mapper), ("close", stages.closer)
         self._lanes = [Lane(name, stage) for name, stage in named if stage is not None]
-        self._laps: dict[str, float] = {}
         self._switching = QuickSwitching()
+        self._between: ThreadPoolExecutor | None = None
+        self._lent: list[Future[None]] = []
+        self._news: list[Keyframe | Loop] = []
 
     @abstractmethod
     def _is_due(self, index: int) -> bool:
@@ -44,58 +57,111 @@ class ParallelWorker(Worker):
         """Give a keyframe to a stage, which may be busy; past the last one, do nothing."""
 
     def advance(self, frame: Frame) -> Estimate:
-        """Write what is due, waiting for it; track the frame; start what its keyframe asks for."""
-        self._laps = {}
-        for index, lane in enumerate(self._lanes):
-            if lane.is_out and self._is_due(index):
-                self._collect(index)
-        estimate = self.stages.tracker.track(frame)
+        """Track the frame on a map in which what is due is written; lend the map until the next."""
+        tracker = self.stages.tracker
+        self._lend(self._write_due)
+        prepared = tracker.prepare(frame)
+        start = time.perf_counter()
+        self._take_back()
+        waited = 1e3 * (time.perf_counter() - start)
+        estimate = tracker.track(prepared)
         self._tell("on_estimate", self.on_estimate, estimate)
         if estimate.is_keyframe:
-            keyframe = self.stages.map.keyframe(estimate.keyframe_id)
-            self._tell("on_keyframe", self.on_keyframe, keyframe)
-            self._hand(0, keyframe)
-        self._tell_map()
-        return replace(estimate, timing={**estimate.timing, **self._laps})
+            self._lend(self._begin_keyframe)
+        return replace(estimate, timing={**estimate.timing, "wait": waited})
 
     def finish(self) -> None:
         """Write all that is out, stage after stage, and end the threads."""
         try:
-            for index, lane in enumerate(self._lanes):
-                while lane.is_out:
-                    self._collect(index)
-            self._tell_map()
+            self._lend(self._write_all)
+            self._take_back()
         finally:
             self.close()
 
     def close(self) -> None:
         """End the threads; a job that is out is lost, unless `finish` wrote it."""
+        if self._between is not None:
+            self._between.shutdown(wait=True, cancel_futures=True)
+            self._between = None
+        self._lent.clear()
         for lane in self._lanes:
             lane.close()
         self._switching.release()
+
+    # ---- the map, lent and taken back ----
+
+    def _lend(self, work: Callable[[], None]) -> None:
+        """Have something done with the map between two frames, after what was asked before."""
+        if self._between is None:
+            self._between = ThreadPoolExecutor(1, thread_name_prefix="odomap between frames")
+        self._lent.append(self._between.submit(work))
+
+    def _take_back(self) -> None:
+        """Wait until nobody else has the map; tell observers what became of it."""
+        try:
+            while self._lent:
+                self._lent[0].result()
+                del self._lent[0]
+        except Exception:
+            del self._lent[0]
+            raise
+        finally:
+            self._tell_news()
+
+    def _tell_news(self) -> None:
+        news, self._news = self._news, []
+        for item in news:
+            if isinstance(item, Loop):
+                self._tell("on_loop", self.on_loop, item)
+            else:
+                self._tell("on_keyframe", self.on_keyframe, item)
+        self._tell_map()
+
+    # ---- between frames ----
+
+    def _write_due(self) -> None:
+        for index, lane in enumerate(self._lanes):
+            if lane.is_out and self._is_due(index):
+                self._collect(index)
+
+    def _write_all(self) -> None:
+        for index, lane in enumerate(self._lanes):
+            while lane.is_out:
+                self._collect(index)
+
+    def _begin_keyframe(self) -> None:
+        """Make the keyframe that the tracker asked for, and start what it asks for."""
+        with self._beside("keyframe"):
+            keyframe = self.stages.tracker.make_keyframe()
+        if keyframe is not None:
+            self._news.append(keyframe)
+            self._hand(0, keyframe)
 
     def _start(self, index: int, keyframe: Keyframe) -> None:
         """Let a stage that is free begin with a keyframe; the next one gets what it leaves."""
         lane = self._lanes[index]
         self._switching.hold()
-        start = time.perf_counter()
-        is_out = lane.start(keyframe)
-        self._lap(lane, start)
+        with self._beside(f"{lane.name} reads"):
+            is_out = lane.start(keyframe)
         if not is_out:
             self._hand(index + 1, keyframe)
 
     def _collect(self, index: int) -> None:
         """Wait for a job, write its change, and give the keyframe to the next stage."""
         lane = self._lanes[index]
-        start = time.perf_counter()
         keyframe, change = lane.collect()
-        change.write(self.stages.map)
-        self._lap(lane, start)
-        for loop in change.loops:
-            self._tell("on_loop", self.on_loop, loop)
+        self._note(f"{lane.name} solves", lane.solved_ms)
+        with self._beside(f"{lane.name} writes"):
+            change.write(self.stages.map)
+        self._news.extend(change.loops)
         self._hand(index + 1, keyframe)
 
-    def _lap(self, lane: Lane, start: float) -> None:
-        """Note what a stage has cost this frame, waiting included."""
-        ms = 1e3 * (time.perf_counter() - start)
-        self._laps[lane.name] = self._laps.get(lane.name, 0.0) + ms
+    @contextmanager
+    def _beside(self, name: str) -> Iterator[None]:
+        """Note how long something takes beside tracking."""
+        start = time.perf_counter()
+        yield
+        self._note(name, 1e3 * (time.perf_counter() - start))
+
+    def _note(self, name: str, ms: float) -> None:
+        self.beside_ms.setdefault(name, []).append(ms)

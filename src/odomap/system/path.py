@@ -63,6 +63,10 @@ class Path:
         self._live.append((frame.stamp_ns, T_world_body, covariance))
         return T_world_body, covariance
 
+    def replace_last(self, frame: Placed) -> None:
+        """Hang the last frame from another keyframe: the one it has become."""
+        self._frames[-1] = frame
+
     def append_late(self, frame: Placed) -> None:
         """Add a frame that could not be placed when it came; it is no part of the live path."""
         self._frames.append(frame)

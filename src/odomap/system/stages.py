@@ -3,19 +3,21 @@
 A run is a chain of three agents over one map. The tracker places every frame; the mapper improves
 the map around each new keyframe; the closer looks for places seen before and corrects the path:
 
-    frame → Tracker.track → Estimate;  keyframe → Mapper.add → Job;  keyframe → Closer.add → Job
+    frame → Tracker.prepare, track → Estimate;  Tracker.make_keyframe → keyframe
+    keyframe → Mapper.add → Job → Change;       keyframe → Closer.add → Job → Change
 
 Tracking must not wait for what takes long, so the work of mapper and closer comes in three parts:
 `add` reads the map (a snapshot: short), `Job.solve` works on what was read and touches the map no
-more (long), `Change.write` writes the result (short). A worker decides which thread runs each part
-and when; inline, one after the other; in parallel, `solve` beside later frames and `write` at a
+more (long), `Change.write` writes the result (short). The tracker has parts as well: `prepare` does
+not need the map, and nobody waits for `make_keyframe`. A worker decides which thread runs each part
+and when; inline, one after the other; in parallel, `solve` beside later frames and `write` before a
 frame that is fixed beforehand, so that the result is the same on every run.
 
 Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR workspaces, 2007.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,11 +90,22 @@ class Job(Protocol):
         ...
 
 
-class Tracker(Protocol):
+P = TypeVar("P")
+
+
+class Tracker(Protocol[P]):
     """Places frames, and makes keyframes of some."""
 
-    def track(self, frame: Frame) -> Estimate:
-        """Place a frame; its keyframe, if it became one, is in the map when this returns."""
+    def prepare(self, frame: Frame) -> P:
+        """Make a frame ready without touching the map, which may be changing meanwhile."""
+        ...
+
+    def track(self, prepared: P) -> Estimate:
+        """Place a frame in the map; the map gets no new keyframe by that, but the very first."""
+        ...
+
+    def make_keyframe(self) -> Keyframe | None:
+        """Make the last frame a keyframe if it is to be one, and return it; else None."""
         ...
 
 
@@ -142,6 +155,6 @@ class Stages:
     """
 
     map: Map
-    tracker: Tracker
+    tracker: Tracker[Any]
     mapper: Mapper | None = None
     closer: Closer | None = None

@@ -6,6 +6,9 @@ camera with depth and one without (`starting`). Two trackers have this face: one
 landmarks of the last keyframe by optical flow (`keyframetracking`), the other searches for those of
 the local map by their descriptors (`maptracking`).
 
+Images are made ready, frames placed and keyframes made in three separate steps: only the last two
+need the map, and who waits for a pose need not wait for the keyframe (`stages`).
+
 When too few landmarks agree with a pose the frame is lost, and says so. It is tried from where it
 is expected, from how the image turned, from where it was, and without any guess; if that fails for
 some frames, tracking starts anew where it was last, with a covariance that admits it.
@@ -14,7 +17,6 @@ Reference: Nistér, Naroditsky, Bergen, "Visual Odometry", CVPR 2004; Mur-Artal,
 T-RO 2017 (stereo keyframes).
 """
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.geometry.pose import SE3
 from odomap.maps.estimate import Estimate, Status, Tracks
+from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.association import Association, TrackingConfig, View
@@ -33,12 +36,13 @@ from odomap.system.dispute import FEWEST, SETTLED
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located
+from odomap.system.looking import Clock, Look, Looker, Unseen, why_lost
 from odomap.system.path import Path, Placed
 from odomap.system.starting import Start, Started, Waiting
 from odomap.system.veil import VEILED, Veil
 from odomap.vision.turning import Thumbnail, turn_between
 
-__all__ = ["Clock", "Known", "Look", "Tracker"]
+__all__ = ["Known", "Tracker"]
 
 Array = NDArray[np.float64]
 
@@ -64,34 +68,18 @@ class Known(Protocol):
 
 K = TypeVar("K", bound=Known)
 
-BLANK = 8.0
-"""Standard deviation of grey levels below which an image shows nothing."""
-
 CLEARLY = 1.5
 """How many times the settled landmarks of the tracked pose must agree with another to win."""
 
 
-class Clock:
-    """Milliseconds per stage; for people, nothing decides by it."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Give the time since the last lap to a stage."""
-        now = time.perf_counter()
-        self.laps[stage] = self.laps.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
-
-
 @dataclass(frozen=True, eq=False)
-class Look:
-    """A frame being tracked: its ideal view, and the clock."""
+class Wanted(Generic[K]):
+    """A placed frame that is to become a keyframe."""
 
-    frame: Frame
-    view: View
-    clock: Clock
+    look: Look
+    known: K
+    located: Located
+    placed: Placed
 
 
 class Tracker(ABC, Generic[K]):
@@ -114,14 +102,14 @@ class Tracker(ABC, Generic[K]):
     def __init__(
         self, map: Map, eye: Eye, association: Association, start: Start, config: TrackingConfig
     ) -> None:
-        self._map, self._eye, self._association = map, eye, association
+        self._map, self._eye, self._looker = map, eye, Looker(eye, association)
         self._start, self._tracking = start, config
         self._veil = Veil(map, eye)
         self._last: View | None = None
-        self._raw: NDArray[np.uint8] | None = None
-        self._newest_ns = -1
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = 0
+        self._wanted: Wanted[K] | None = None
+        self._made: int | None = None
 
     # ---- what trackers differ in ----
 
@@ -155,44 +143,45 @@ class Tracker(ABC, Generic[K]):
 
     # ---- tracking ----
 
-    def track(self, frame: Frame) -> Estimate:
-        """Place one frame; its keyframe, if it became one, is in the map when this returns."""
-        clock = Clock()
-        if frame.stamp_ns <= self._newest_ns:
-            return self._lose(frame, "its time is not after that of the frame before", clock)
-        self._newest_ns = frame.stamp_ns
-        image = self._eye.image(frame)
-        if image is None:
-            return self._lose(frame, f"the {self._eye.name} image is missing", clock)
-        if self._is_frozen(frame):
-            return self._lose(frame, "the image is the one before, bit by bit: frozen?", clock)
-        look = Look(frame, self._association.view(frame.id, frame.stamp_ns, image), clock)
-        clock.lap("prepare")
+    def prepare(self, frame: Frame) -> Look | Unseen:
+        """Find the features of a frame, without looking at the map."""
+        return self._looker.look(frame, is_begun=len(self.path) > 0)
+
+    def track(self, look: Look | Unseen) -> Estimate:
+        """Place a frame; if it is to become a keyframe, `make_keyframe` makes it one."""
+        look.clock.resume()
+        self._made = None
+        if isinstance(look, Unseen):
+            return self._lose(look.frame, look.reason, look.clock)
         known = self._known()
         if known is None:
             return self._begin(look)
         known, located, status = self._locate(look.view, known)
-        clock.lap("track")
+        look.clock.lap("track")
         if located.num_inliers >= self._tracking.min_inliers:
             return self._accept(look, known, located, status)
         is_patient = self._lost < self._tracking.patience or self._veil.is_shown(look.view)
         if not is_patient and self._may_start_anew():
             return self._begin(look)
-        return self._lose(frame, _why_lost(located, self._tracking.min_inliers, look.view), clock)
+        reason = why_lost(located, self._tracking.min_inliers, look.view)
+        return self._lose(look.frame, reason, look.clock)
+
+    def make_keyframe(self) -> Keyframe | None:
+        """Make the last frame a keyframe, if it is to be one; return it once it is in the map."""
+        wanted, self._wanted = self._wanted, None
+        if wanted is not None:
+            self._made = self._make_keyframe(
+                wanted.look, wanted.known, wanted.located, wanted.placed
+            )
+            hangs = Placed(wanted.placed.stamp_ns, self._made, np.eye(4), np.zeros((6, 6)))
+            self.path.replace_last(hangs)
+            self._since_keyframe = 0
+        made, self._made = self._made, None
+        return None if made is None else self._map.keyframe(made)
 
     def _may_start_anew(self) -> bool:
         """Say whether one that is lost for long may begin again."""
         return True
-
-    def _is_frozen(self, frame: Frame) -> bool:
-        """Say whether a frame shows the very same image as the one before, though it is no blank.
-
-        Even of a camera that stands still no two images are equal: there is noise.
-        """
-        before, self._raw = self._raw, frame.images[self._eye.index]
-        if before is None or self._raw is None or not len(self.path):
-            return False
-        return np.array_equal(before, self._raw) and float(before.std()) > BLANK
 
     # ---- the three ways a frame can go ----
 
@@ -207,6 +196,7 @@ class Tracker(ABC, Generic[K]):
         self._since_keyframe, self._lost = 0, 0
         self._first_count = started.count
         self._begun(started)
+        self._made = started.placed[-1].keyframe_id
         self._last = look.view
         for placed in started.placed[:-1]:
             self.path.append_late(placed)
@@ -249,11 +239,7 @@ class Tracker(ABC, Generic[K]):
             look.frame, look.view, known.landmark_ids, located, self._keyframes.ranger
         ):
             reason, is_keyframe = f"{VEILED}: no keyframe", False
-        if is_keyframe:
-            keyframe_id = self._make_keyframe(look, known, located, placed)
-            placed = Placed(placed.stamp_ns, keyframe_id, np.eye(4), np.zeros((6, 6)))
-            self._since_keyframe = 0
-            look.clock.lap("keyframe")
+        self._wanted = Wanted(look, known, located, placed) if is_keyframe else None
         return self._estimate(
             look, status, reason, placed, located.num_inliers, is_keyframe, tracks
         )
@@ -376,20 +362,3 @@ class Tracker(ABC, Generic[K]):
         gap = (stamp_ns - self.path.last.stamp_ns) * 1e-9
         unseen = (np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5]) + np.abs(self.path.velocity())) * gap
         return np.asarray(self.path.last_covariance() + np.diag(unseen**2))
-
-
-def _why_lost(located: Located, needed: int, view: View) -> str:
-    """Say in a sentence why too few observations agree."""
-    contrast = float(view.pyramid[-1].std())
-    if contrast < BLANK:
-        cause = (
-            f"the image is nearly uniform (contrast {contrast:.0f} of 255): covered lens, no light?"
-        )
-    elif not located.expected:
-        cause = "none of the landmarks is where the camera is expected to look"
-    elif len(located.rows) < needed:
-        again = f"{len(located.rows)} of {located.expected} landmarks found again"
-        cause = f"{again}: motion blur or too fast?"
-    else:
-        cause = "what was found does not fit one motion: moving objects or a wrong calibration?"
-    return f"{located.num_inliers} inliers of {needed} needed: {cause}"

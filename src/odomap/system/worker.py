@@ -72,6 +72,7 @@ class Worker(ABC):
         frames_dropped: frames that were never tracked, since tracking was behind (live).
         jobs_skipped: keyframes that a stage never saw, since it was behind (live).
         messages_dropped: what observers were not told, since one was slow (live).
+        beside_ms: milliseconds of what was done beside tracking, by name (lockstep, live).
     """
 
     def __init__(self, stages: Stages) -> None:
@@ -83,6 +84,7 @@ class Worker(ABC):
         self.failures: list[ObserverFailure] = []
         self.interrupted = False
         self.frames_dropped = self.jobs_skipped = self.messages_dropped = 0
+        self.beside_ms: dict[str, list[float]] = {}
         self._told_version = stages.map.version
 
     @abstractmethod
@@ -184,12 +186,15 @@ class InlineWorker(Worker):
 
     def advance(self, frame: Frame) -> Estimate:
         """Track a frame; if it became a keyframe, map and close before returning."""
-        estimate = self.stages.tracker.track(frame)
+        tracker = self.stages.tracker
+        estimate = tracker.track(tracker.prepare(frame))
         self._tell("on_estimate", self.on_estimate, estimate)
-        if estimate.is_keyframe:
-            keyframe = self.stages.map.keyframe(estimate.keyframe_id)
-            self._tell("on_keyframe", self.on_keyframe, keyframe)
+        start = time.perf_counter()
+        keyframe = tracker.make_keyframe()
+        if keyframe is not None:
             timing = dict(estimate.timing)
+            timing["keyframe"] = timing.get("keyframe", 0.0) + 1e3 * (time.perf_counter() - start)
+            self._tell("on_keyframe", self.on_keyframe, keyframe)
             for name, stage in (("map", self.stages.mapper), ("close", self.stages.closer)):
                 start = time.perf_counter()
                 job = stage.add(keyframe) if stage is not None else None

@@ -6,7 +6,7 @@ exactly was run. Plots are vector drawings in the page and follow its light or d
 recordings are thinned, so that the page stays below some megabytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -212,8 +212,21 @@ def _timing(report: Report) -> str:
     )
     return (
         f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
-        f"{table(head, rows, numbers=[1, 2, 3, 4, 5])}"
+        f"{table(head, rows, numbers=[1, 2, 3, 4, 5])}{_beside(report)}"
     )
+
+
+def _beside(report: Report) -> str:
+    """Return what ran beside the frames, in threads of its own."""
+    given = report.metrics.get("beside_ms")
+    if not isinstance(given, Mapping) or not given:
+        return ""
+    rows = [
+        [text(name), f"{ms['count']:,}", *(significant(ms[k], 3) for k in ("median", "p95", "max"))]
+        for name, ms in given.items()
+    ]
+    head = ["Beside the frames", "times", "median ms", "p95 ms", "max ms"]
+    return table(head, rows, numbers=[1, 2, 3, 4])
 
 
 def _frames(report: Report) -> str:
