@@ -144,6 +144,9 @@ def test_places_compete_by_the_sums_of_their_groups():
     assert [g[3] for g in groups] == pytest.approx([0.9, 0.5])
     assert [g[0] for g in group_scores(found, covisible, 10, 0.75)] == [2]
     assert [g[1].tolist() for g in group_scores(found, covisible, 2, 0.75)] == [[2, 1]]
+    # 3 is the best of a group of its own, but sees what 2 sees
+    together[1], together[3] = [], [8]
+    assert [g[0] for g in group_scores(found, covisible, 10, 0.2)] == [2, 7]
     nothing = Candidates(np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     assert group_scores(nothing, covisible, 10, 0.75) == []
 

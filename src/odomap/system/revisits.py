@@ -159,7 +159,8 @@ def group_scores(
 
     Returns:
         For each place its best keyframe, the group of that, the score of it and the summed score
-        of the best group it is in; the best sum first. No keyframe is the best of two places.
+        of the best group it is in; the best sum first. A keyframe of a better place's group is no
+        place of its own.
     """
     scores = dict(zip(found.keyframe_ids.tolist(), found.scores.tolist()))
     groups = {k: np.append(k, covisible(k))[:size].astype(np.int64) for k in scores}
@@ -170,5 +171,8 @@ def group_scores(
         winner = min(inside, key=lambda m: (-scores[m], m))
         best[winner] = max(total, best.get(winner, 0.0))
     bar = share * max(best.values(), default=0.0)
-    kept = sorted((k for k in best if best[k] >= bar), key=lambda k: (-best[k], k))
+    kept: list[int] = []
+    for k in sorted((k for k in best if best[k] >= bar), key=lambda k: (-best[k], k)):
+        if not any(k in groups[better] for better in kept):
+            kept.append(k)
     return [(k, groups[k], scores[k], best[k]) for k in kept]
