@@ -3,7 +3,8 @@
 The features of a frame are matched to the local map (`localmap`, `maplocating`). Frames hang from
 the keyframe that shares most landmarks with them, which need not be the last one: a camera that
 comes back to a place is tracked against what was mapped there. A frame becomes a keyframe when it
-shows clearly less of the map than its keyframe, that is, something new.
+shows clearly less of the map than its keyframe, that is, something new; not where the map knows
+the place already (`passed`).
 
 When a frame cannot be placed from where it is expected, it is looked up in the whole map by what it
 shows (`recognition`). Where the map is not to be changed, no keyframe is made.
@@ -27,9 +28,9 @@ from odomap.system.localmap import LocalMap, local_map
 from odomap.system.locating import Located
 from odomap.system.looking import Look
 from odomap.system.maplocating import MapLocator
+from odomap.system.passed import Passed
 from odomap.system.path import Placed
 from odomap.system.recognition import Recognizer
-from odomap.system.revisiting import Passed
 from odomap.system.starting import Start, Started
 from odomap.system.tracking import Tracker
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from odomap.system.revisiting import FEW, LONG_AGO, NEW, OLD, Passed
+from odomap.system.passed import FEW, LONG_AGO, NEW, OLD, Passed
 
 WIDTH = 320
 

@@ -1,4 +1,4 @@
-"""Places seen before: where the map knows already what a view shows, it needs no keyframe.
+"""Keyframes passed: where the map knows already what a view shows, it needs no new one.
 
 Whether a frame becomes a keyframe is decided by how many landmarks it shows, compared with those
 found just after the last keyframe was made. In a place seen before that misleads. A new keyframe
