@@ -211,6 +211,7 @@ class Outputs:
             map=MapView.of(result.map, scale),
             growth=logbook.growth(),
             mapping=metrics["mapping"] or {},
+            beside_ms=metrics.get("beside_ms", {}),
         )
 
     def _write_report(self, report: "Report") -> None:

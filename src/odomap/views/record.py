@@ -117,6 +117,7 @@ class Report:
         map: what the map holds at the end, to be drawn; None for none.
         growth: how the map and the memory grew, or None.
         mapping: what local mapping made and dropped, by name.
+        beside_ms: what ran beside the frames: count, median, p95 and max by name.
     """
 
     title: str
@@ -138,6 +139,7 @@ class Report:
     environment: Mapping[str, str] = field(default_factory=environment)
     map: "MapView | None" = None
     growth: Growth | None = None
+    beside_ms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mapping: Mapping[str, int] = field(default_factory=dict)
 
     @property

@@ -6,7 +6,7 @@ exactly was run. Plots are vector drawings in the page and follow its light or d
 recordings are thinned, so that the page stays below some megabytes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -218,12 +218,11 @@ def _timing(report: Report) -> str:
 
 def _beside(report: Report) -> str:
     """Return what ran beside the frames, in threads of its own."""
-    given = report.metrics.get("beside_ms")
-    if not isinstance(given, Mapping) or not given:
+    if not report.beside_ms:
         return ""
     rows = [
         [text(name), f"{ms['count']:,}", *(significant(ms[k], 3) for k in ("median", "p95", "max"))]
-        for name, ms in given.items()
+        for name, ms in report.beside_ms.items()
     ]
     head = ["Beside the frames", "times", "median ms", "p95 ms", "max ms"]
     return table(head, rows, numbers=[1, 2, 3, 4])
