@@ -117,13 +117,20 @@ class ConvertWords:
     """Where to write it."""
     depth: Annotated[int | None, tyro.conf.arg(metavar="L")] = None
     """Levels to keep; each less makes it ten times smaller."""
+    quiet: bool = False
+    """No progress."""
 
     def execute(self) -> int:
         """Read, cut, write, and say what was made."""
         from odomap.files.vocabulary import SUFFIX, Vocabulary
 
-        is_ours = self.file.suffix == SUFFIX
-        vocabulary = Vocabulary.load(self.file) if is_ours else Vocabulary.read_dbow2(self.file)
+        with Steps("reading", self.quiet) as steps:
+            is_ours = self.file.suffix == SUFFIX
+            vocabulary = (
+                Vocabulary.load(self.file)
+                if is_ours
+                else Vocabulary.read_dbow2(self.file, steps.show)
+            )
         if self.depth is not None:
             vocabulary = vocabulary.cut(self.depth)
         vocabulary.save(self.out)

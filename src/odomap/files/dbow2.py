@@ -16,7 +16,7 @@ import gzip
 import lzma
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -29,6 +29,8 @@ from odomap.errors import InputError
 from odomap.vision.vocabulary import LEAST_BRANCHING, MOST_BRANCHING, MOST_DEPTH, MOST_NODES
 
 __all__ = ["Dbow2Nodes", "read_dbow2_nodes"]
+
+Progress = Callable[[int, int, str], None]
 
 CELLS = 35
 """Numbers in a line: parent, is it a leaf, 32 bytes, weight."""
@@ -58,8 +60,12 @@ class Dbow2Nodes:
     weights: NDArray[np.float64]
 
 
-def read_dbow2_nodes(path: str | Path) -> Dbow2Nodes:
+def read_dbow2_nodes(path: str | Path, progress: Progress | None = None) -> Dbow2Nodes:
     """Read a vocabulary in DBoW2's text format, plain or packed by gzip or xz.
+
+    Args:
+        path: the file.
+        progress: called with nodes read, 0 (how many there are is not known) and a text.
 
     Raises:
         InputError: it cannot be read, or is broken; names the line.
@@ -68,7 +74,7 @@ def read_dbow2_nodes(path: str | Path) -> Dbow2Nodes:
     try:
         with _opened(file) as stream:
             branching, depth = _header(file, stream)
-            parts = list(_parts(file, stream))
+            parts = list(_parts(file, stream, progress))
     except (EOFError, gzip.BadGzipFile, lzma.LZMAError, zlib.error) as error:
         raise InputError(f"{file}: is broken or cut off ({error}): copy it again") from error
     except OSError as error:
@@ -114,7 +120,9 @@ def _header(path: Path, stream: BinaryIO) -> tuple[int, int]:
     return branching, depth
 
 
-def _parts(path: Path, stream: BinaryIO) -> Iterator[tuple[NDArray[np.generic], ...]]:
+def _parts(
+    path: Path, stream: BinaryIO, progress: Progress | None
+) -> Iterator[tuple[NDArray[np.generic], ...]]:
     """Yield parents, leaves, centres and weights, some thousand lines at a time."""
     done = 0
     lines = (line for line in iter(lambda: stream.readline(LONGEST_LINE), b"") if line.strip())
@@ -135,6 +143,8 @@ def _parts(path: Path, stream: BinaryIO) -> Iterator[tuple[NDArray[np.generic], 
                 "a weight"
             )
         done += len(part)
+        if progress is not None:
+            progress(done, 0, f"{done} nodes")
         yield (
             values[:, 0].astype(np.int32),
             values[:, 1] > 0,
