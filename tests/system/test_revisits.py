@@ -138,15 +138,15 @@ def test_places_compete_by_the_sums_of_their_groups():
         return np.array(together[k], np.int64)
 
     groups = group_scores(found, covisible, 10, 0.5)
-    assert [g[0] for g in groups] == [2, 7]
-    assert groups[0][1].tolist() == [2, 1, 3, 4]
-    assert [g[2] for g in groups] == [0.4, 0.5]
-    assert [g[3] for g in groups] == pytest.approx([0.9, 0.5])
+    assert [g[0] for g in groups] == [7, 2]
+    assert groups[1][1].tolist() == [2, 1, 3, 4]
+    assert [g[2] for g in groups] == [0.5, 0.4]
+    assert [g[3] for g in groups] == pytest.approx([0.5, 0.9])
     assert [g[0] for g in group_scores(found, covisible, 10, 0.75)] == [2]
     assert [g[1].tolist() for g in group_scores(found, covisible, 2, 0.75)] == [[2, 1]]
     # 3 is the best of a group of its own, but sees what 2 sees
     together[1], together[3] = [], [8]
-    assert [g[0] for g in group_scores(found, covisible, 10, 0.2)] == [2, 7]
+    assert [g[0] for g in group_scores(found, covisible, 10, 0.2)] == [7, 2]
     nothing = Candidates(np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     assert group_scores(nothing, covisible, 10, 0.75) == []
 

@@ -116,7 +116,7 @@ class Revisits:
                 (`Map.covisible(k)[0]`).
 
         Returns:
-            The places, the best first, also those that did not last long enough yet.
+            The places, the most alike first, also those that did not last long enough yet.
         """
         config, before = self._config, self._before
         self._before = bow
@@ -159,8 +159,8 @@ def group_scores(
 
     Returns:
         For each place its best keyframe, the group of that, the score of it and the summed score
-        of the best group it is in; the best sum first. A keyframe of a better place's group is no
-        place of its own.
+        of the best group it is in; the best keyframe first. A keyframe of a better one's group is
+        no place of its own.
     """
     scores = dict(zip(found.keyframe_ids.tolist(), found.scores.tolist()))
     groups = {k: np.append(k, covisible(k))[:size].astype(np.int64) for k in scores}
@@ -172,7 +172,7 @@ def group_scores(
         best[winner] = max(total, best.get(winner, 0.0))
     bar = share * max(best.values(), default=0.0)
     kept: list[int] = []
-    for k in sorted((k for k in best if best[k] >= bar), key=lambda k: (-best[k], k)):
+    for k in sorted((k for k in best if best[k] >= bar), key=lambda k: (-scores[k], k)):
         if not any(k in groups[better] for better in kept):
             kept.append(k)
     return [(k, groups[k], scores[k], best[k]) for k in kept]
