@@ -18,7 +18,7 @@ from meter import Meter
 
 from odomap.errors import OdomapError
 from odomap.files.trajectories import write_tum
-from odomap.kernels import modules_with_kernels, warm_up
+from odomap.kernels import needed_modules, warm_up
 from odomap.maps.estimate import Status
 from odomap.run import RHYTHM, chosen_config
 from odomap.sources.open import open as open_source
@@ -60,10 +60,8 @@ def play(options: argparse.Namespace) -> None:
     config = chosen_config(options.preset or usual, None, assignments, source.rig)
     make = make_odometry if options.odometry_only else Slam
     system = make(source.rig, config, options.rhythm)
-    imported = set(sys.modules)
-    for name in modules_with_kernels():
-        if name in imported or name.startswith("odomap.geometry."):
-            warm_up(name)
+    for name in needed_modules():
+        warm_up(name)
     meter = Meter()
     start, first = 0.0, 0
     statuses: list[Status] = []

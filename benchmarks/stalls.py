@@ -35,7 +35,7 @@ import cv2
 import numpy as np
 from played import SKIPPED
 
-from odomap.kernels import modules_with_kernels, warm_up
+from odomap.kernels import needed_modules, warm_up
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sources.open import open as open_source
@@ -211,10 +211,8 @@ def run(source: Source, config: Config, rhythm: str, frames: int = 0, paced: boo
     system.map.lock = lock = TracedLock()  # type: ignore[assignment]
     parts = Parts()
     parts.watch(system.worker.stages.mapper)
-    imported = set(sys.modules)
-    for module in modules_with_kernels():
-        if module in imported:
-            warm_up(module)
+    for module in needed_modules():
+        warm_up(module)
     stalls, placing, is_beside = [], [], []
     start, first = 0.0, 0
     for count, frame in enumerate(source):

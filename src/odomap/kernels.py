@@ -12,14 +12,18 @@ through them.
 
 import importlib
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast, overload
 
-__all__ = ["clear_cache", "kernel", "modules_with_kernels", "warm_up"]
+__all__ = ["clear_cache", "kernel", "modules_with_kernels", "needed_modules", "warm_up"]
 
 _PACKAGE = Path(__file__).parent
+
+LATE = ("odomap.geometry.", "odomap.maps.views_kernels")
+"""Modules that are often used without their kernels, which are imported at their first use."""
 F = TypeVar("F", bound=Callable[..., object])
 
 
@@ -64,6 +68,15 @@ def modules_with_kernels() -> list[str]:
         if file != Path(__file__) and "\ndef warm_up(" in file.read_text(encoding="utf-8"):
             names.append(".".join(("odomap", *file.relative_to(_PACKAGE).with_suffix("").parts)))
     return names
+
+
+def needed_modules() -> list[str]:
+    """Return those of them that are imported by now, or will be when their kernels are first used.
+
+    Once a system is made, what it did not import it does not need.
+    """
+    imported = set(sys.modules)  # looking for kernels imports packages
+    return [n for n in modules_with_kernels() if n in imported or n.startswith(LATE)]
 
 
 def warm_up(name: str) -> float:

@@ -236,17 +236,14 @@ def _opened(data: str | Path, rig: "Rig | str | Path | None") -> "Source":
 def _warm_up(tell: Callable[[Progress], None]) -> float:
     """Compile, or load from the cache, the kernels of what is imported; return the seconds.
 
-    By now the source is open and the system imported: what they did not import they do not need,
-    but for geometry, which loads its kernels at their first use.
+    By now the source is open and the system imported.
     """
     import odomap.system.odometry
     import odomap.system.slam  # noqa: F401 (they load the modules whose kernels a run needs)
-    from odomap.kernels import modules_with_kernels, warm_up
+    from odomap.kernels import needed_modules, warm_up
 
     start = time.perf_counter()
-    imported = set(sys.modules)  # looking for kernels imports packages
-    geometry = "odomap.geometry."
-    names = [n for n in modules_with_kernels() if n in imported or n.startswith(geometry)]
+    names = needed_modules()
     for index, name in enumerate(names):
         tell(Progress("compiling", index, len(names), text=name))
         warm_up(name)

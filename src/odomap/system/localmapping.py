@@ -204,17 +204,18 @@ class LocalMapper:
         return float(self._camera.fx * across)
 
     def _window(self, snapshot: Snapshot, keyframe_id: int) -> LocalWindow:
+        # Copies: a kernel would be compiled again for arrays that must not be written to.
         ids = snapshot.landmark_ids
         return LocalWindow(
             snapshot.keyframes,
-            snapshot.is_fixed,
+            np.array(snapshot.is_fixed),
             snapshot.Ts_world_body @ self.T_body_camera,
-            snapshot.points_world,
+            np.array(snapshot.points_world),
             self._map.descriptors(ids),
             self._map.count_observers(ids),
-            snapshot.obs_keyframe,
-            snapshot.obs_landmark,
-            snapshot.obs_keypoint,
+            np.array(snapshot.obs_keyframe),
+            np.array(snapshot.obs_landmark),
+            np.array(snapshot.obs_keypoint),
             int(np.flatnonzero(snapshot.keyframe_ids == keyframe_id)[0]),
             self._camera,
             self._sections.sigma_px,
