@@ -152,7 +152,7 @@ def _sum(words: Whole, weights: Whole, ranges: Whole, pool: Whole, sums: Index) 
     for i in range(len(words)):
         start, a = ranges[words[i], 0], weights[i]
         for k in range(start, start + ranges[words[i], 1]):
-            sums[pool[k, 0]] += min(a, pool[k, 1]) + COUNT
+            sums[pool[k, 0]] += np.int64(min(a, pool[k, 1])) + COUNT
 
 
 def warm_up() -> None:
