@@ -164,8 +164,8 @@ class VocabularyTree:
         bare = np.zeros(int((children == 0).sum()))
         blank = cls(centres.view(np.uint8), children, bare, branching, depth, len(parts))
         image_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        pairs = np.unique(np.stack([blank.words_of(together), image_of]), axis=1)
-        found = np.bincount(pairs[0], minlength=len(bare))
+        pairs = np.unique(blank.words_of(together) * len(parts) + image_of)
+        found = np.bincount(pairs // len(parts), minlength=len(bare))
         weights = np.log(len(parts) / found)  # each word was found in an image: it has members
         return cls(blank.centres, children, weights, branching, depth, len(parts))
 
