@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from odomap.system.passed import FEW, LONG_AGO, NEW, OLD, Passed
+from odomap.maps.map import Map
+from odomap.system.config import preset
+from odomap.system.passed import FEW, LONG_AGO, NEW, Passed
+from odomap.system.slam import Slam
+from system.test_localmapping import small_loop, walk
 
 WIDTH = 320
 
@@ -67,11 +71,13 @@ def test_a_map_that_was_there_before_is_old_as_a_whole():
     assert not knows(way, all_of(8))
 
 
-@pytest.mark.parametrize(("part", "expected"), [(OLD + 0.05, True), (OLD - 0.05, False)])
-def test_most_of_what_was_found_must_be_old(part, expected):
+def test_only_what_is_old_speaks_for_a_place_seen_before():
+    """New landmarks all over the view change nothing, neither for it nor against it."""
     way = passed(*range(LONG_AGO + 1))
-    anchors = np.where(np.arange(1500) < part * 1500, 0, LONG_AGO)
-    assert knows(way, anchors) is expected
+    old, new = spread(1500, seed=1), spread(3000, seed=2)
+    found = np.concatenate([old, new])
+    assert not knows(way, np.full(len(found), LONG_AGO), found)
+    assert knows(way, np.repeat([0, LONG_AGO], [len(old), len(new)]), found)
 
 
 @pytest.mark.parametrize(("part", "expected"), [(NEW - 0.1, True), (NEW + 0.1, False)])
@@ -94,3 +100,13 @@ def test_pixels_at_the_rim_are_pixels():
     elsewhere = np.concatenate([corners, [[0, 100], [WIDTH / 2, 100]]])
     assert not way.is_known(np.zeros(3, np.int64), corners, elsewhere, WIDTH)
     assert not way.is_known(np.zeros(3, np.int64), corners, np.empty((0, 2)), WIDTH)
+
+
+@pytest.mark.parametrize("name", ["stereo", "rgbd"])
+def test_a_map_that_is_continued_in_the_same_place_does_not_grow(name):
+    loop = walk(small_loop(24), rounds=2)
+    before = Slam(loop.rig, preset(name))
+    made = [before.track(frame).is_keyframe for frame in loop.part(0, 24)]
+    after = Slam(loop.rig, preset(name), map=Map.restored(before.map.dump()))
+    again = [after.track(frame).is_keyframe for frame in loop.part(24, 48)]
+    assert sum(again) == 0 < sum(made)

@@ -5,11 +5,11 @@ found just after the last keyframe was made. In a place seen before that mislead
 there makes landmarks of whatever has none, a few frames later many of those are not found again,
 so there is another keyframe, and so on round after round, though all that is seen is old.
 
-The map knows a view when most of what was found in it is old, and when that is everywhere: with
-features in the cells of a grid laid over the image, the part of them in cells where no landmark was
-found is small,
+The map knows a view when old landmarks are found everywhere in it: with a grid over the image,
 
-    |{features in cells without a landmark}| / |{features}| ≤ 1/4.
+    |{features in cells without an old landmark}| / |{features}| ≤ 0.3.
+
+Only old ones count: those of a keyframe made a moment ago lie all over the view wherever it is.
 
 How old a landmark is is told by neither time nor the number of keyframes since: a camera may rest,
 and one that comes back makes none. It is told by the keyframes that were passed since, those that
@@ -36,10 +36,8 @@ LONG_AGO = 40
 """Passed so many keyframes ago: several windows of local mapping."""
 FEW = 5
 """Keyframes between which a camera may go there and back without passing any."""
-OLD = 0.6
-"""Part of the landmarks found that must be old in a place seen before."""
-NEW = 0.25
-"""Part of the features that must lie where nothing was found for something new to be there."""
+NEW = 0.3
+"""Part of the features that must lie where nothing old was found for something new to be there."""
 CELLS = 16
 """Cells of the grid across the image."""
 
@@ -80,10 +78,10 @@ class Passed:
             features: (N, 2) pixels of all features of the view.
             width: of the image, pixels.
         """
-        if not len(features) or not len(anchors) or np.mean(anchors <= self._old) < OLD:
+        if not len(features):
             return False
-        size = width / CELLS
-        return bool(np.mean(~np.isin(_cells(features, size), _cells(found, size))) <= NEW)
+        size, old = width / CELLS, found[anchors <= self._old]
+        return bool(np.mean(~np.isin(_cells(features, size), _cells(old, size))) <= NEW)
 
 
 def _cells(pixels: Array | Pixels, size: float) -> Index:
