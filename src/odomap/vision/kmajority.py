@@ -11,7 +11,7 @@ again, level by level. Members are only ever re-ordered: a cluster is a range of
 and a member lies in the child whose centre is nearest to it, ties to the first.
 
 Cost: O(n k rounds) for each of the levels, 2 ns a distance: a million descriptors in five levels
-of ten take some 20 s. The same members, order and seed give the same tree.
+of ten take some 10 s. The same members, order and seed give the same tree.
 
 Reference: Grana, Borghesani, Manfredi, Cucchiara, "A fast approach for integrating ORB descriptors
 in the bag of words model", SPIE 8667, 2013; Arthur, Vassilvitskii, "k-means++", SODA 2007.

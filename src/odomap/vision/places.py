@@ -9,9 +9,9 @@ and gets their scores all at once,
 What a good score is depends on how many features there are and how much they repeat; compare it
 with that of the keyframe just before (`system/revisits`), never with a constant alone.
 
-Cost of a query: 1 to 2 ms with 10,000 keyframes of 1,000 features; of one more keyframe 0.1 ms, and
-some 20 ms where an index has to grow, which has 4,096 keyframes at most. A keyframe takes
-some 20 kB. Scores are exact to 1e-6. One thread at a time may use it.
+Cost of a query: some 2 ms with 10,000 keyframes of 1,000 features; of one more keyframe 0.1 ms,
+and up to 50 ms where an index has to grow, which has 4,096 keyframes at most. A keyframe takes some
+20 kB. Scores are exact to 1e-6. One thread at a time may use it.
 
 Reference: Gálvez-López, Tardós, "Bags of binary words for fast place recognition in image
 sequences", T-RO 28(5), 2012; Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section III-E.
