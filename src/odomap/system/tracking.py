@@ -19,7 +19,7 @@ T-RO 2017 (stereo keyframes).
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -68,6 +68,10 @@ class Known(Protocol):
 
 K = TypeVar("K", bound=Known)
 
+LEAP = 5.0
+"""Standard deviations of where a body unseen may be beyond which it has not moved by itself."""
+WELL = 2
+"""How many times the inliers needed must be settled for such a leap to be believed."""
 CLEARLY = 1.5
 """How many times the settled landmarks of the tracked pose must agree with another to win."""
 
@@ -107,7 +111,7 @@ class Tracker(ABC, Generic[K]):
         self._veil = Veil(map, eye)
         self._last: View | None = None
         self.path = Path(map)
-        self._since_keyframe = self._lost = self._first_count = 0
+        self._since_keyframe = self._lost = self._first_count = self._piece = 0
         self._wanted: Wanted[K] | None = None
         self._made: int | None = None
 
@@ -156,11 +160,12 @@ class Tracker(ABC, Generic[K]):
         known = self._known()
         if known is None:
             return self._begin(look)
-        known, located, status = self._locate(look.view, known)
+        known, located, status = self._locate(self._veil.lifted(look.view), known)
+        located = self._of_one_piece(known, located)
         look.clock.lap("track")
         if located.num_inliers >= self._tracking.min_inliers:
             return self._accept(look, known, located, status)
-        is_patient = self._lost < self._tracking.patience or self._veil.is_shown(look.view)
+        is_patient = self._lost < self._tracking.patience or self._veil.is_shown
         if not is_patient and self._may_start_anew():
             return self._begin(look)
         reason = why_lost(located, self._tracking.min_inliers, look.view)
@@ -196,6 +201,7 @@ class Tracker(ABC, Generic[K]):
         self._since_keyframe, self._lost = 0, 0
         self._first_count = started.count
         self._begun(started)
+        self._piece = int(started.reference.landmark_ids.min()) if anew else 0
         self._made = started.placed[-1].keyframe_id
         self._last = look.view
         for placed in started.placed[:-1]:
@@ -302,7 +308,8 @@ class Tracker(ABC, Generic[K]):
             best = located if best is None or located.num_inliers > best.num_inliers else best
         assert best is not None
         again = self._without_guess(view, known)
-        if again is not None and self._convinces(again, (known, best)):
+        is_likely = again is not None and self._is_likely(*again, view.stamp_ns)
+        if again is not None and is_likely and self._convinces(again, (known, best)):
             return *again, Status.RECOVERED
         if best.num_inliers >= self._tracking.min_inliers:
             best = self._try(view, known, best.T_world_body, 0)
@@ -321,6 +328,27 @@ class Tracker(ABC, Generic[K]):
         if against < FEWEST:
             return again[1].num_inliers > tracked[1].num_inliers
         return votes > CLEARLY * against
+
+    def _of_one_piece(self, known: K, located: Located) -> Located:
+        """Leave out what is older than a new start, until enough of it agrees.
+
+        Where the body is in the older piece of the map is not known, so a few of its landmarks
+        are found by chance; as observations they would tie the pieces together wrongly.
+        """
+        is_older = located.inliers & (known.landmark_ids[located.rows] < self._piece)
+        if int(is_older.sum()) < self._tracking.min_inliers:
+            return replace(located, inliers=located.inliers & ~is_older)
+        self._piece = 0
+        return located
+
+    def _is_likely(self, known: K, located: Located, stamp_ns: int) -> bool:
+        """Say whether the body may be there: near enough for the time unseen, or well attested."""
+        moved = np.linalg.norm(located.T_world_body[:3, 3] - self.path.last_pose()[:3, 3])
+        sigma = np.sqrt(np.trace(self._gap_covariance(stamp_ns)[:3, :3]))
+        settled, least = self._count_settled(known, located), self._tracking.min_inliers
+        if self._veil.is_shown and settled < least:  # the others may be on what hides the known
+            return False
+        return bool(moved <= LEAP * sigma) or settled >= WELL * least
 
     def _count_settled(self, known: K, located: Located) -> int:
         """Count the settled landmarks that agree with a pose."""

@@ -12,15 +12,17 @@ expected landmarks hardly one is found. A feature there with depth z veils it if
     NEARER · z < z of every landmark expected around.
 
 Where a good part of all features do, no keyframe is made: frames are placed by what is known
-alone, or not at all. One that is lost must not start anew on what has hidden the map: its
-descriptors are remembered, and as long as an image shows many of them it is still there.
+alone, or not at all. What hid the known is remembered by its descriptors, and as long as an image
+shows many of them they are left out of the search, and one that is lost does not start anew.
 
-Cost: linear in landmarks and features, and a measurement of depth for suspicious ones; it is
-asked only when a keyframe is due.
+Cost: linear in landmarks and features, and a measurement of depth for suspicious ones, when a
+keyframe is due; a comparison of descriptors per frame while something is remembered.
 
 Reference: Tan, Liu, Dong, Zhang, Bao, "Robust Monocular SLAM in Dynamic Environments", ISMAR 2013
 (landmarks that a change of the scene has hidden).
 """
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -33,6 +35,7 @@ from odomap.system.association import View
 from odomap.system.eye import Eye
 from odomap.system.locating import Located
 from odomap.system.ranging import Ranger
+from odomap.vision.features import Corners
 
 __all__ = ["VEILED", "Veil"]
 
@@ -66,11 +69,15 @@ class Veil:
     Args:
         map: what is known.
         eye: the camera.
+
+    Attributes:
+        is_shown: whether the view that was lifted last shows it.
     """
 
     def __init__(self, map: Map, eye: Eye) -> None:
         self._map, self._eye = map, eye
         self._descriptors = _NOTHING
+        self.is_shown = False
 
     def hides(
         self, frame: Frame, view: View, landmark_ids: Index, located: Located, ranger: Ranger | None
@@ -84,9 +91,9 @@ class Veil:
             located: where it is, and which of those were expected and found.
             ranger: measures depth; without it nothing can be said.
         """
-        self._descriptors = _NOTHING
         if ranger is None or not len(view.corners.keypoints):
             return False
+        self._descriptors = _NOTHING
         behind = self._hidden(view, landmark_ids, located)
         rows = np.flatnonzero(np.isfinite(behind))
         if len(rows) <= SHARE * len(behind):
@@ -99,13 +106,19 @@ class Veil:
         self._descriptors = view.descriptors[rows]
         return True
 
-    def is_shown(self, view: View) -> bool:
-        """Say whether a view still shows what hid the known."""
+    def lifted(self, view: View) -> View:
+        """Return a view without what hid the known; if that is gone, it is forgotten."""
         wanted = self._descriptors
-        if not len(wanted) or not len(view.descriptors):
-            return False
-        matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(wanted, view.descriptors)
-        return sum(m.distance <= ALIKE for m in matches) > STILL * len(wanted)
+        if not len(wanted):
+            return view
+        index, alike = _nearest(view.descriptors, wanted)
+        self.is_shown = len(np.unique(index[alike])) > STILL * len(wanted)
+        if not self.is_shown:
+            self._descriptors = _NOTHING
+            return view
+        at, corners = ~alike, view.corners
+        seen = Corners(corners.keypoints[at], corners.strength[at], corners.level[at])
+        return replace(view, corners=seen, descriptors=view.descriptors[at])
 
     def _hidden(self, view: View, landmark_ids: Index, located: Located) -> Array:
         """Return how far the nearest of the landmarks is that are hidden around each feature.
@@ -145,3 +158,11 @@ def _around(cells: NDArray[np.generic], gather: np.ufunc) -> Array:
     rows = gather(gather(cells[:-2], cells[1:-1]), cells[2:])
     out[1:-1, 1:-1] = gather(gather(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
     return out
+
+
+def _nearest(descriptors: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> tuple[Index, Mask]:
+    """Return (n,) which of others each descriptor is nearest to, and whether it may be the same."""
+    index, alike = np.zeros(len(descriptors), np.int64), np.zeros(len(descriptors), np.bool_)
+    for match in cv2.BFMatcher(cv2.NORM_HAMMING).match(descriptors, wanted):
+        index[match.queryIdx], alike[match.queryIdx] = match.trainIdx, match.distance <= ALIKE
+    return index, alike
