@@ -94,8 +94,11 @@ def _stereo() -> Config:
 
 
 def _mono() -> Config:
+    # A camera that moves forwards sees its landmarks grow and turn: more of their bits change, and
+    # few landmarks to spare has the one that makes them from parallax alone.
     return Config(
         orb=OrbConfig(levels=5),
+        matching=MatchConfig(max_hamming=80),
         tracking=TrackingConfig(sensors="mono"),
         bundle=BundleConfig(iterations=8),
     )
