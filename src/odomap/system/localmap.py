@@ -88,6 +88,11 @@ class LocalMap:
         return self.views.ids
 
     @property
+    def seen_ids(self) -> Index:
+        """Ids of the landmarks that the keyframe sees."""
+        return self.views.ids[np.isfinite(self.keypoints[:, 0])]
+
+    @property
     def num_seen(self) -> int:
         """How many landmarks the keyframe sees."""
         return int(np.count_nonzero(np.isfinite(self.keypoints[:, 0])))

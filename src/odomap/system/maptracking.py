@@ -39,6 +39,8 @@ __all__ = ["MapTracker"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+SHARE = 0.3
+"""Part of the likely landmarks of a single camera that must agree before others are looked for."""
 FULLY = 0.9
 """A frame that shows this part of what its keyframe showed adds nothing, however late it comes."""
 STILL = 0.005
@@ -81,6 +83,8 @@ class MapTracker(Tracker[LocalMap]):
         self._epoch = map.epoch
         self._due: tuple[int, Array] | None = None
         self._shown = np.empty(0, np.int64)
+        self._most_shown = 0
+        self._is_single = config.tracking.sensors == "mono"
         self._expected_often: list[Index] = []
         self._seen_often: list[Index] = []
         self._passed = Passed(int(map.keyframe_ids.max(initial=-1)))
@@ -91,6 +95,7 @@ class MapTracker(Tracker[LocalMap]):
         keyframe_id = started.reference.keyframe_id
         self._turn_later(keyframe_id, self._map.T_world_body(keyframe_id))
         self._shown = started.reference.landmark_ids
+        self._most_shown = started.count
 
     def _known(self) -> LocalMap | None:
         """Return the local map, read again where the mapper has changed the map."""
@@ -101,6 +106,9 @@ class MapTracker(Tracker[LocalMap]):
             self._turn_to(due[0], self.path.last_pose() if is_changed else due[1])
             if is_changed:
                 self._shown = self._map.resolve(self._shown)
+                if self._is_single and self._local is not None:
+                    # What the mapper has made since no frame has shown, but the keyframe sees it.
+                    self._shown = np.union1d(self._shown, self._local.seen_ids)
         return self._local
 
     def _turn_later(self, keyframe_id: int, T_world_body: Array) -> None:
@@ -146,7 +154,11 @@ class MapTracker(Tracker[LocalMap]):
     # ---- placing ----
 
     def _try(self, view: View, known: LocalMap, T_world_body: Array, needed: int) -> Located:
-        return self._locator.locate(view, known, known.rows_of(self._shown), T_world_body, needed)
+        likely = known.rows_of(self._shown)
+        if self._is_single:  # of those that are likely as large a part is asked for as of all
+            share = max(self._tracking.min_inliers, int(SHARE * len(likely)))
+            needed = min(needed, share)
+        return self._locator.locate(view, known, likely, T_world_body, needed)
 
     def _begin(self, look: Look) -> Estimate:
         """Start; in a map that was there before, where the view is recognised."""
@@ -206,8 +218,12 @@ class MapTracker(Tracker[LocalMap]):
         config = self._config.tracking
         if not self._is_mapping:
             return False
+        # A single camera's landmarks come from the mapper, some frames late: what the keyframe
+        # itself has shown counts until then, and the most that was shown since.
+        self._most_shown = max(self._most_shown, located.num_inliers)
+        base = self._most_shown if self._is_single else self._first_count
         # Of a place seen before as much is wanted as was seen there, not as at the last keyframe.
-        shown = located.num_inliers / max(min(self._first_count, known.num_seen), 1)
+        shown = located.num_inliers / max(min(base, known.num_seen), 1)
         if shown < config.keyframe_ratio:
             return not self._is_seen_before(known, located)
         motion = self._motion_px(known, located) / self._eye.camera.width
@@ -235,6 +251,7 @@ class MapTracker(Tracker[LocalMap]):
         made = self._keyframes.add(look.view, T_world_body, seen, known.keyframe_id, covariance)
         self._turn_later(made.keyframe_id, T_world_body)
         self._shown = made.landmark_ids
+        self._most_shown = located.num_inliers
         return made.keyframe_id
 
     def _may_start_anew(self) -> bool:
