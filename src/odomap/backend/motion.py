@@ -26,6 +26,9 @@ __all__ = ["MotionSolution", "Sightings", "solve_motion", "warm_up"]
 
 Array = NDArray[np.float64]
 
+LEAST_STEP = 0.01
+"""Steps smaller than this, in standard deviations of the pose, change nothing that matters."""
+
 
 @dataclass(frozen=True)
 class Sightings:
@@ -119,60 +122,122 @@ def solve_motion(
     return MotionSolution(T, covariance, chi2, chi2 <= gate * gate, bool(converged))
 
 
-@kernel
-def _add(
+@kernel(reorder=True)
+def _gather(
     R: Array,
     t: Array,
     R_cb: Array,
     t_cb: Array,
     baseline: float,
-    p: Array,
+    points: Array,
     xy: Array,
-    disparity: float,
+    disparity: Array,
     weights: Array,
     width: float,
-    J: Array,
+    chi2: Array,
+    limit: float,
     H: Array,
     b: Array,
 ) -> None:
-    """Add w JᵀJ to the lower half of H and −w Jᵀr to b, for a point in front of the camera.
+    """Write H = Σ w JᵀJ (6, 6) and b = −Σ w Jᵀr (6,) of the points whose χ² is within a limit.
 
-    J is that of `reproject_with_jacobians`, in a scratch array; without a disparity it is two rows.
+    For a motion (v, ω) of the point in the camera's axes, X + v + ω × X, the rows of J are
+
+        x: s (1, 0, −x, −X y, Z + X x, −Y),  y: s (0, 1, −y, −Z − Y y, Y x, X),  s = w_xy / Z,
+        disparity: d (0, 0, 1, Y, −X, 0),  d = −w_d baseline / Z²,
+
+    and by the adjoint of the mount the system becomes one of the body's motion (`_of_body`).
     """
-    q0, q1, q2 = p[0] - t[0], p[1] - t[1], p[2] - t[2]
-    b0 = R[0, 0] * q0 + R[1, 0] * q1 + R[2, 0] * q2
-    b1 = R[0, 1] * q0 + R[1, 1] * q1 + R[2, 1] * q2
-    b2 = R[0, 2] * q0 + R[1, 2] * q1 + R[2, 2] * q2
-    X = R_cb[0, 0] * b0 + R_cb[0, 1] * b1 + R_cb[0, 2] * b2 + t_cb[0]
-    Y = R_cb[1, 0] * b0 + R_cb[1, 1] * b1 + R_cb[1, 2] * b2 + t_cb[1]
-    Z = R_cb[2, 0] * b0 + R_cb[2, 1] * b1 + R_cb[2, 2] * b2 + t_cb[2]
-    if not Z > 1e-3:
-        return
-    inverse = 1.0 / Z
-    x, y, scale = X * inverse, Y * inverse, weights[0] * inverse
-    r0, r1, r2 = weights[0] * (x - xy[0]), weights[0] * (y - xy[1]), 0.0
-    rows, bend = 2, 0.0
-    if disparity == disparity:
-        rows, r2 = 3, weights[1] * (baseline * inverse - disparity)
-        bend = -weights[1] * baseline * inverse * inverse
-    for k in range(3):
-        J[0, k] = -(scale * (R_cb[0, k] - x * R_cb[2, k]))
-        J[1, k] = -(scale * (R_cb[1, k] - y * R_cb[2, k]))
-        J[2, k] = -(bend * R_cb[2, k])
-    for i in range(rows):
-        J[i, 3] = J[i, 2] * b1 - J[i, 1] * b2
-        J[i, 4] = J[i, 0] * b2 - J[i, 2] * b0
-        J[i, 5] = J[i, 1] * b0 - J[i, 0] * b1
-    w = huber_weight(r0 * r0 + r1 * r1 + r2 * r2, width)
+    vx, vy, vz, wx, wy, wz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # Σ w Jᵀ r
+    xx, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0  # translation by translation; x by y is zero
+    x_wx, x_wy, x_wz, y_wx, y_wy, y_wz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    z_wx, z_wy, z_wz = 0.0, 0.0, 0.0
+    wxx, wxy, wxz, wyy, wyz, wzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for o in range(len(xy)):
+        if not chi2[o] <= limit:
+            continue
+        q0, q1, q2 = points[o, 0] - t[0], points[o, 1] - t[1], points[o, 2] - t[2]
+        b0 = R[0, 0] * q0 + R[1, 0] * q1 + R[2, 0] * q2
+        b1 = R[0, 1] * q0 + R[1, 1] * q1 + R[2, 1] * q2
+        b2 = R[0, 2] * q0 + R[1, 2] * q1 + R[2, 2] * q2
+        X = R_cb[0, 0] * b0 + R_cb[0, 1] * b1 + R_cb[0, 2] * b2 + t_cb[0]
+        Y = R_cb[1, 0] * b0 + R_cb[1, 1] * b1 + R_cb[1, 2] * b2 + t_cb[1]
+        Z = R_cb[2, 0] * b0 + R_cb[2, 1] * b1 + R_cb[2, 2] * b2 + t_cb[2]
+        if not Z > 1e-3:
+            continue
+        inverse = 1.0 / Z
+        x, y, s, d = X * inverse, Y * inverse, weights[o, 0] * inverse, 0.0
+        r0, r1, r2 = weights[o, 0] * (x - xy[o, 0]), weights[o, 0] * (y - xy[o, 1]), 0.0
+        if disparity[o] == disparity[o]:
+            r2 = weights[o, 1] * (baseline * inverse - disparity[o])
+            d = -weights[o, 1] * baseline * inverse * inverse
+        w = huber_weight(r0 * r0 + r1 * r1 + r2 * r2, width)
+        # Rows of J by their columns beyond the first ones, which are s and 0, or 0 and s.
+        a2, a3, a4, a5 = -s * x, -s * X * y, s * (Z + X * x), -s * Y
+        e2, e3, e4, e5 = -s * y, -s * (Z + Y * y), s * Y * x, s * X
+        f3, f4 = d * Y, -d * X
+        ws, wr0, wr1, wr2 = w * s, w * r0, w * r1, w * r2
+        vx += s * wr0
+        vy += s * wr1
+        vz += a2 * wr0 + e2 * wr1 + d * wr2
+        wx += a3 * wr0 + e3 * wr1 + f3 * wr2
+        wy += a4 * wr0 + e4 * wr1 + f4 * wr2
+        wz += a5 * wr0 + e5 * wr1
+        xx += ws * s
+        xz += ws * a2
+        yz += ws * e2
+        x_wx += ws * a3
+        x_wy += ws * a4
+        x_wz += ws * a5
+        y_wx += ws * e3
+        y_wy += ws * e4
+        y_wz += ws * e5
+        zz += w * (a2 * a2 + e2 * e2 + d * d)
+        z_wx += w * (a2 * a3 + e2 * e3 + d * f3)
+        z_wy += w * (a2 * a4 + e2 * e4 + d * f4)
+        z_wz += w * (a2 * a5 + e2 * e5)
+        wxx += w * (a3 * a3 + e3 * e3 + f3 * f3)
+        wxy += w * (a3 * a4 + e3 * e4 + f3 * f4)
+        wxz += w * (a3 * a5 + e3 * e5)
+        wyy += w * (a4 * a4 + e4 * e4 + f4 * f4)
+        wyz += w * (a4 * a5 + e4 * e5)
+        wzz += w * (a5 * a5 + e5 * e5)
+    yy = xx
+    H[0, 0], H[1, 0], H[1, 1], H[2, 0], H[2, 1], H[2, 2] = xx, 0.0, yy, xz, yz, zz
+    H[3, 0], H[3, 1], H[3, 2], H[3, 3] = x_wx, y_wx, z_wx, wxx
+    H[4, 0], H[4, 1], H[4, 2], H[4, 3], H[4, 4] = x_wy, y_wy, z_wy, wxy, wyy
+    H[5, 0], H[5, 1], H[5, 2], H[5, 3], H[5, 4], H[5, 5] = x_wz, y_wz, z_wz, wxz, wyz, wzz
+    b[0], b[1], b[2], b[3], b[4], b[5] = vx, vy, vz, wx, wy, wz
+
+
+@kernel
+def _of_body(R_cb: Array, t_cb: Array, H: Array, b: Array, Ad: Array, half: Array) -> None:
+    """Turn H and b into those of the body: H ← Adᵀ H Ad and b ← Adᵀ b, Ad of the mount.
+
+    The point moves by −Ad ξ where the body moves by ξ, and b, gathered as Σ w Jᵀr of the former,
+    is −Σ w Jᵀr of the latter.
+    """
+    for i in range(3):
+        for j in range(3):
+            k, m = (i + 1) % 3, (i + 2) % 3
+            Ad[i, j], Ad[i + 3, j + 3], Ad[i + 3, j] = R_cb[i, j], R_cb[i, j], 0.0
+            Ad[i, j + 3] = t_cb[k] * R_cb[m, j] - t_cb[m] * R_cb[k, j]
     for i in range(6):
-        if rows == 3:
-            b[i] -= w * (J[0, i] * r0 + J[1, i] * r1 + J[2, i] * r2)
+        for j in range(6):
+            half[i, j] = 0.0
             for k in range(6):
-                H[i, k] += w * (J[0, i] * J[0, k] + J[1, i] * J[1, k] + J[2, i] * J[2, k])
-        else:
-            b[i] -= w * (J[0, i] * r0 + J[1, i] * r1)
+                half[i, j] += (H[i, k] if k <= i else H[k, i]) * Ad[k, j]
+    for j in range(6):
+        for i in range(6):
+            H[i, j] = 0.0
             for k in range(6):
-                H[i, k] += w * (J[0, i] * J[0, k] + J[1, i] * J[1, k])
+                H[i, j] += Ad[k, i] * half[k, j]
+    for i in range(6):
+        half[0, i] = b[i]
+    for i in range(6):
+        b[i] = 0.0
+        for k in range(6):
+            b[i] += Ad[k, i] * half[0, k]
 
 
 @kernel
@@ -192,9 +257,12 @@ def _solve_kernel(
     chi2: Array,
     covariance: Array,
 ) -> bool:
-    """Gauss-Newton, R and t in place: first with all observations, then with those in the gate."""
-    r, J = np.empty(3), np.empty((3, 6))
-    H, b = np.empty((6, 6)), np.empty(6)
+    """Gauss-Newton, R and t in place: first with all observations, then with those in the gate.
+
+    A step δ is small if δᵀ H δ, its square in standard deviations of the pose, is.
+    """
+    r, Ad, half = np.empty(3), np.empty((6, 6)), np.empty((6, 6))
+    H, b, g = np.empty((6, 6)), np.empty(6), np.empty(6)
     R_new, t_new = np.empty((3, 3)), np.empty(3)
     converged, size = False, np.inf
     for phase in range(2):
@@ -204,42 +272,44 @@ def _solve_kernel(
             )
             chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if in_front else np.inf
         for _ in range(iterations):
-            H[:, :] = 0.0
-            b[:] = 0.0
-            for o in range(len(xy)):
-                # A gate twice as wide at first lets back in what a poor start put outside.
-                if phase == 0 or chi2[o] <= 4.0 * gate * gate:
-                    _add(
-                        R,
-                        t,
-                        R_cb,
-                        t_cb,
-                        baseline,
-                        points[o],
-                        xy[o],
-                        disparity[o],
-                        weights[o],
-                        width,
-                        J,
-                        H,
-                        b,
-                    )
+            # A gate twice as wide at first lets back in what a poor start put outside.
+            limit = np.inf if phase == 0 else 4.0 * gate * gate
+            _gather(
+                R,
+                t,
+                R_cb,
+                t_cb,
+                baseline,
+                points,
+                xy,
+                disparity,
+                weights,
+                width,
+                chi2,
+                limit,
+                H,
+                b,
+            )
+            _of_body(R_cb, t_cb, H, b, Ad, half)
             converged = False
             if not factor(H):
                 return False
+            for a in range(6):
+                g[a] = b[a]
             solve(H, b)
             se3_retract(R, t, b, R_new, t_new)
             for a in range(3):
                 t[a] = t_new[a]
                 for c in range(3):
                     R[a, c] = R_new[a, c]
-            size = 0.0
+            size, decrement = 0.0, 0.0
             for a in range(6):
                 size += b[a] * b[a]
+                decrement += g[a] * b[a]
             size = np.sqrt(size)
             if not np.isfinite(size):
                 return False
-            if size < 1e-6:
+            if decrement < LEAST_STEP * LEAST_STEP or size < 1e-6:
                 converged = True
                 break
     for o in range(len(xy)):
