@@ -108,10 +108,11 @@ def _rgbd() -> Config:
     # Cameras with a depth image are held by hand, blur, and expose row after row: points are where
     # the model of one instant says only to a pixel or so, and depth is that of another instant.
     return Config(
-        tracking=TrackingConfig(sensors="rgbd", keyframe_ratio=0.93),
+        tracking=TrackingConfig(sensors="rgbd", keyframe_ratio=0.9),
         bundle=BundleConfig(iterations=8),
         noise=NoiseConfig(feature_px=1.0),
         depth=DepthConfig(noise=0.003),
+        threads=ThreadConfig(mapping_delay=2),
     )
 
 
