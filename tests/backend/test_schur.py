@@ -61,6 +61,9 @@ def reduce(bundle, damping=0.0):
         np.full((n, 6, 3), np.nan),
         np.full((m, 3, 3), np.nan),
         np.full((m, 3), np.nan),
+        np.full((n, 3), np.nan),
+        np.full((n, 3, 6), np.nan),
+        np.full((n, 3, 3), np.nan),
     )
     points = bundle.points_world.copy()
     cost = reduced_system(poses, points, cameras, seen, WIDTH, damping, system)

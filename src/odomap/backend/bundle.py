@@ -322,6 +322,9 @@ def _solve_kernel(
         np.empty((len(seen.pose), 6, 3)),
         np.empty((len(points), 3, 3)),
         np.empty((len(points), 3)),
+        np.empty((len(seen.pose), 3)),
+        np.empty((len(seen.pose), 3, 6)),
+        np.empty((len(seen.pose), 3, 3)),
     )
     moved = np.empty_like(points)
     trial_poses = PoseArrays(np.empty_like(poses.R), np.empty_like(poses.t), poses.column)
@@ -360,7 +363,7 @@ def _solve_kernel(
         _hold_scale(poses, system.S)
     if factor(system.S):
         invert(system.S, joint)
-        disparity_response(poses, points, cameras, seen, width, system, response, evidence)
+        disparity_response(poses, seen, width, system, response, evidence)
         pulls = response.copy()
         for e in range(3):
             for a in range(size):
