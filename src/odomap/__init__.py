@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from odomap.files.mapfile import MapFile, load_map, save_map
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
+    from odomap.files.vocabulary import Vocabulary
     from odomap.geometry.camera import Camera
     from odomap.geometry.pose import SE2, SE3, SO3, Sim3
     from odomap.geometry.robust import Loss
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from odomap.system.slam import Slam
     from odomap.system.visual import Result
     from odomap.viewing import View
+    from odomap.vision.places import Places
 
 __all__ = [
     "SE2",
@@ -99,6 +101,7 @@ __all__ = [
     "MonocularVO",
     "OdomapError",
     "OutputError",
+    "Places",
     "PoseGraph",
     "Priors",
     "Result",
@@ -115,6 +118,7 @@ __all__ = [
     "TrackingFailed",
     "Trajectory",
     "View",
+    "Vocabulary",
     "World",
     "__version__",
     "adjust",
@@ -173,6 +177,7 @@ _HOMES = {
     "MonocularVO": "system.odometry",
     "OdomapError": "errors",
     "OutputError": "errors",
+    "Places": "vision.places",
     "PoseGraph": "backend.graphs.posegraph",
     "Priors": "backend.graphs.posegraph",
     "Result": "system.visual",
@@ -192,6 +197,7 @@ _HOMES = {
     "TrackingFailed": "errors",
     "Trajectory": "geometry.trajectory",
     "View": "viewing",
+    "Vocabulary": "files.vocabulary",
     "World": "simulation.world",
     "adjust": "backend.adjustment.adjust",
     "ate": "evaluation.metrics",
