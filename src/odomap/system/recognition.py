@@ -1,34 +1,30 @@
 """Recognition: where in a map a view was taken, without a prediction.
 
-The features of the view are compared by descriptor alone with those that keyframes have landmarks
-at. The keyframes with the most clear matches are candidates; each is joined by those that share
-its landmarks, and pairs of pixel and landmark give the pose: P3P in RANSAC, then a guided search
-for the landmarks that the pose expects to be seen, then least squares,
+With a vocabulary the view's words name the keyframes that are candidates (`placeindex`). Words are
+made here, of the keyframes' features: a map made with another vocabulary needs nothing. Without
+one, features of the view are compared with those that keyframes have landmarks at, and keyframes
+with the most clear matches are candidates. From a candidate and those around it follows the pose
+(`resection`). Nothing is drawn but from the caller's seed.
 
-    min over T_world_camera of  Σ ρ(|π(T_world_camera⁻¹ pᵢ) - xᵢ|² / σ(levelᵢ)²).
-
-A pose counts only if enough landmarks agree and their pixels are spread: a single poster looks the
-same on every wall. Spread is the area of the ellipse with the pixels' covariance, 4 π √det Σ.
-Nothing is drawn but from the caller's seed.
-
-Cost: O(K N M) for K keyframes of M landmarks and N features. K is bounded by `most`; what was not
-compared is compared by the next call, so that all of a large map have their turn.
+Cost: with words some 10 ms, however large the map. Without, O(K N M) for K keyframes of M landmarks
+and N features: K is bounded by `most`; what was not compared is compared by the next call, so that
+all of a large map have their turn.
 
 Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
 T-RO 2015, section V-C (relocalisation).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
-from odomap.geometry.lie import se3_inverse
-from odomap.geometry.pnp import PnpResult, refine_pose, solve_pnp
-from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.vision.matching import MatchConfig, match_guided, nearest
+from odomap.system.placeindex import PlaceIndex, described
+from odomap.system.resection import FEWEST, Place, Recognised, Resection, Sight, votes
+from odomap.vision.matching import MatchConfig
+from odomap.vision.vocabulary import VocabularyTree
 
 __all__ = ["MOST", "Recognised", "Recognizer", "describes_places"]
 
@@ -37,63 +33,17 @@ Index = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
 
 MOST = 100
-"""Keyframes compared per call."""
+"""Keyframes compared per call, where no words tell which."""
+AT_ONCE = 40
+"""Keyframes that get their words in a call: some 15 ms."""
 VOTERS = 250
 """Features of the view that vote for keyframes; all are matched with the candidates."""
 CANDIDATES = 4
 """Keyframes that a pose is looked for with."""
+PLACES = 3
+"""Places that a pose is looked for in, where words tell them."""
 NEIGHBOURS = 5
 """Keyframes that join a candidate: those that share most landmarks with it."""
-FIRST_INLIERS = 8
-"""Landmarks that must agree by descriptors alone for the guided search to begin."""
-THRESHOLD_PX = 4.0
-"""Largest error of an inlier on the finest level."""
-GUIDED_PX = 8.0
-"""Radius in which landmarks are looked for once there is a pose."""
-SPREAD = 0.05
-"""Share of the image that the inliers must cover."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recognised:
-    """Where a view was taken.
-
-    Attributes:
-        T_world_camera: (4, 4).
-        covariance: (6, 6) of it, tangent (translation, rotation), right update.
-        landmark_ids: (n,) landmarks seen in the view.
-        rows: (n,) at which of its features.
-        keyframe_id: the keyframe that sees most of them.
-    """
-
-    T_world_camera: Array
-    covariance: Array
-    landmark_ids: Index
-    rows: Index
-    keyframe_id: int
-
-    @property
-    def num_inliers(self) -> int:
-        """How many landmarks agree with the pose."""
-        return len(self.rows)
-
-
-@dataclass(frozen=True, eq=False)
-class _Sight:
-    """The view: descriptors (N, 32), keypoints (N, 2), and their (N,) σ, 1 on the finest level."""
-
-    descriptors: Descriptors
-    keypoints: Array
-    sigma: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A keyframe's landmarks (M,), and how they look in it, (M, 32)."""
-
-    keyframe_id: int
-    landmark_ids: Index
-    descriptors: Descriptors
 
 
 class Recognizer:
@@ -106,6 +56,8 @@ class Recognizer:
         matching: how descriptors are compared.
         min_inliers: landmarks that must agree.
         level_scale: size of a pyramid level's pixels relative to those of the finer one.
+        vocabulary: finds keyframes by words; what the map holds gets its words now. Without it,
+            views are compared with one keyframe after the other.
     """
 
     def __init__(
@@ -116,11 +68,19 @@ class Recognizer:
         matching: MatchConfig,
         min_inliers: int,
         level_scale: float = 1.2,
+        vocabulary: VocabularyTree | None = None,
     ) -> None:
-        self._map, self._camera, self._T_body_camera = map, camera, T_body_camera
+        self._map, self._T_body_camera = map, T_body_camera
         self._matching, self._min_inliers = matching, min_inliers
         self._level_scale = level_scale
+        self._resection = Resection(map, camera, matching, min_inliers)
         self._tried: set[int] = set()
+        self._index = None if vocabulary is None else PlaceIndex(map, vocabulary)
+
+    def keep_up(self, most: int = 1) -> None:
+        """Take in keyframes that are new in the map, at most some: less to do for `find`."""
+        if self._index is not None:
+            self._index.keep_up(most)
 
     def find(
         self,
@@ -139,35 +99,50 @@ class Recognizer:
             keypoints: (N, 2) their pixels.
             levels: (N,) their pyramid levels.
             seed: of the random draws.
-            guess: (4, 4) a T_world_camera: keyframes near it are compared first; by default the
-                newest are.
-            most: keyframes to compare; the next calls go on with the others, until one succeeds.
+            guess: (4, 4) a T_world_camera: without words, keyframes near it are compared first; by
+                default the newest are.
+            most: keyframes to compare without words; the next calls go on with the others, until
+                one succeeds.
 
         Returns:
             The pose and what is seen, or a sentence that says why there is none.
         """
         sigma = self._level_scale ** levels.astype(np.float64)
-        view = _Sight(descriptors, np.asarray(keypoints, np.float64), sigma)
+        view = Sight(descriptors, np.asarray(keypoints, np.float64), levels, sigma)
         if len(descriptors) < self._min_inliers:
             return f"{len(descriptors)} features of {self._min_inliers} needed: nothing to see?"
-        places = self._next_places(guess, most)
-        if not places:
+        if self._index is None:
+            places, compared = self._alike_by_looks(view, guess, most)
+        else:
+            bow = self._index.words(descriptors)
+            view = replace(view, nodes=bow.nodes)
+            self._index.keep_up(AT_ONCE)
+            places, compared = self._places(self._index.find(bow, PLACES)), len(self._index)
+        if not compared:
             return "no keyframe of the map has landmarks with descriptors"
-        step = -(-len(descriptors) // VOTERS)
-        voters = np.ascontiguousarray(descriptors[::step])
-        votes = [self._votes(voters, place) for place in places]
         best, reason = 0, "nothing of the map looks like this"
-        for row in np.argsort(-np.asarray(votes), kind="stable")[:CANDIDATES].tolist():
-            found = self._locate(view, places[row], seed)
+        for place in places:
+            found = self._resection.locate(view, self._around(place), seed)
             if isinstance(found, Recognised):
                 self._tried.clear()
                 return found
             agreed, said = found
             if agreed > best:
                 best, reason = agreed, said
-        return f"{reason}; {len(places)} of {self._map.num_keyframes} keyframes compared"
+        return f"{reason}; {compared} of {self._map.num_keyframes} keyframes compared"
 
-    def _next_places(self, guess: Array | None, most: int) -> list[_Place]:
+    def _alike_by_looks(
+        self, view: Sight, guess: Array | None, most: int
+    ) -> tuple[list[Place], int]:
+        """Return the keyframes that a view looks like, of some that are next; and how many."""
+        step = -(-len(view.descriptors) // VOTERS)
+        voters = np.ascontiguousarray(view.descriptors[::step])
+        places = self._next_places(guess, most)
+        counts = [votes(voters, place, self._matching) for place in places]
+        best = np.argsort(-np.asarray(counts), kind="stable")[:CANDIDATES]
+        return [places[row] for row in best.tolist()], len(places)
+
+    def _next_places(self, guess: Array | None, most: int) -> list[Place]:
         """Return the next keyframes to compare; from the first again when all had their turn."""
         ids = self._in_order(guess)
         left = [k for k in ids if k not in self._tried]
@@ -176,8 +151,7 @@ class Recognizer:
             left = ids
         chosen = left[:most]
         self._tried.update(chosen)
-        places = [self._place(k) for k in chosen]
-        return [place for place in places if place is not None]
+        return self._places(chosen)
 
     def _in_order(self, guess: Array | None) -> list[int]:
         """Return all keyframes, the nearest to a guess first, or the newest."""
@@ -190,138 +164,33 @@ class Recognizer:
         distance = np.linalg.norm(centers - guess[:3, 3], axis=1)
         return [int(k) for k in ids[np.argsort(distance, kind="stable")]]
 
-    def _place(self, keyframe_id: int) -> _Place | None:
-        """Return what a keyframe sees; None where that is nothing that could be recognised."""
-        features = self._map.keyframe(keyframe_id).features
-        if features is None or features.descriptors.shape[1] != 32:
+    def _around(self, place: Place) -> list[Place]:
+        """Return a place and those that share most landmarks with it."""
+        near = self._map.covisible(place.keyframe_id)[0][:NEIGHBOURS]
+        return [place, *self._places(near.tolist())]
+
+    def _places(self, keyframe_ids: list[int]) -> list[Place]:
+        """Return what keyframes see, those left out that see nothing that could be recognised."""
+        places = (self._place(k) for k in keyframe_ids)
+        return [place for place in places if place is not None]
+
+    def _place(self, keyframe_id: int) -> Place | None:
+        descriptors = described(self._map, keyframe_id)
+        if descriptors is None:
             return None
-        ids, keypoints = self._map.observations_of(keyframe_id)
-        ids, keypoints = ids[keypoints >= 0], keypoints[keypoints >= 0]
-        if len(ids) < FIRST_INLIERS:
+        ids, rows = self._map.observations_of(keyframe_id)
+        ids, rows = ids[rows >= 0], rows[rows >= 0]
+        if len(ids) < FEWEST:
             return None
-        return _Place(keyframe_id, ids, np.ascontiguousarray(features.descriptors[keypoints]))
-
-    def _votes(self, descriptors: Descriptors, place: _Place) -> int:
-        """Return how many features clearly look like something that a keyframe sees."""
-        _, distance, second = nearest(descriptors, place.descriptors)
-        return int(np.count_nonzero(self._is_clear(distance, second)))
-
-    def _pairs(self, descriptors: Descriptors, place: _Place) -> tuple[Index, Index]:
-        """Return features (n,) and the landmarks (n,) they clearly look like, and which do so."""
-        match, distance, second = nearest(descriptors, place.descriptors)
-        rows = np.flatnonzero(self._is_clear(distance, second))
-        looked_at, back = np.unique(match[rows], return_inverse=True)
-        mutual = nearest(place.descriptors[looked_at], descriptors)[0][back] == rows
-        return rows[mutual], place.landmark_ids[match[rows[mutual]]]
-
-    def _is_clear(self, distance: Index, second: Index) -> NDArray[np.bool_]:
-        limits = self._matching
-        return (distance <= limits.max_hamming) & (distance < limits.ratio * second)
-
-    def _locate(self, view: _Sight, place: _Place, seed: int) -> Recognised | tuple[int, str]:
-        """Find the pose from a candidate and its neighbours.
-
-        Returns:
-            What was recognised, or how many landmarks agreed at most and what was wrong.
-        """
-        near = self._map.covisible(place.keyframe_id)[0][:NEIGHBOURS].tolist()
-        group = [place, *(p for p in map(self._place, near) if p is not None)]
-        rows, ids = _joined([self._pairs(view.descriptors, p) for p in group])
-        start = solve_pnp(
-            self._map.points_world(ids),
-            view.keypoints[rows],
-            self._camera,
-            seed=seed,
-            threshold_px=THRESHOLD_PX,
-            sigma_px=view.sigma[rows],
-            min_inliers=FIRST_INLIERS,
-        )
-        if not start.converged:
-            return start.num_inliers, self._too_few(start.num_inliers)
-        result, rows, ids = self._grown(view, group, start)
-        rows, ids = rows[result.inliers], ids[result.inliers]
-        if len(rows) < self._min_inliers:
-            return len(rows), self._too_few(len(rows))
-        share = _spread(view.keypoints[rows]) / (self._camera.width * self._camera.height)
-        if not result.converged or share < SPREAD:
-            why = result.reason or f"all that agrees is in {100 * share:.0f} % of the image"
-            return len(rows), why
-        return Recognised(
-            result.T_world_camera.matrix, result.covariance, ids, rows, _most_seen(group, ids)
-        )
-
-    def _too_few(self, agreed: int) -> str:
-        return f"{agreed} landmarks agree of {self._min_inliers} needed: another place?"
-
-    def _grown(
-        self, view: _Sight, group: list[_Place], start: PnpResult
-    ) -> tuple[PnpResult, Index, Index]:
-        """Look for all landmarks that a pose expects to be seen, and refine it on them.
-
-        Returns:
-            The refined pose, features (n,) and their landmarks (n,).
-        """
-        ids, first = np.unique(np.concatenate([p.landmark_ids for p in group]), return_index=True)
-        looks = np.concatenate([p.descriptors for p in group])[first]
-        points = self._map.points_world(ids)
-        result, config = start, replace(self._matching, radius_px=GUIDED_PX)
-        for _ in range(2):
-            T_camera_world = se3_inverse(np.asarray(result.T_world_camera.matrix))
-            ahead = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-            guess = self._camera.project(ahead)
-            guess[~self._camera.is_inside(guess)] = np.nan
-            found = match_guided(
-                looks, guess, view.descriptors, view.keypoints.astype(np.float32), config
-            )
-            seen = np.flatnonzero(found >= 0)
-            rows = found[seen]
-            result = refine_pose(
-                points[seen],
-                view.keypoints[rows],
-                self._camera,
-                result.T_world_camera,
-                threshold_px=THRESHOLD_PX,
-                sigma_px=view.sigma[rows],
-                huber=1.5,
-            )
-        return result, rows, ids[seen]
+        nodes = None if self._index is None else self._index.nodes(keyframe_id)
+        nodes = None if nodes is None else nodes[rows]
+        return Place(keyframe_id, ids, np.ascontiguousarray(descriptors[rows]), nodes)
 
 
 def describes_places(map: Map) -> bool:
     """Return whether a map has what recognition needs: landmarks seen by described features."""
     with map.lock:
         return any(
-            _is_described(map.keyframe(k)) and len(map.observations_of(k)[0])
+            described(map, k) is not None and len(map.observations_of(k)[0])
             for k in map.keyframe_ids.tolist()
         )
-
-
-def _is_described(keyframe: Keyframe) -> bool:
-    features = keyframe.features
-    return features is not None and features.descriptors.shape[1] == 32
-
-
-def _joined(pairs: list[tuple[Index, Index]]) -> tuple[Index, Index]:
-    """Join the matches of several keyframes, the one that most of them agree on first.
-
-    Returns:
-        Features (n,) and landmarks (n,), none of them twice.
-    """
-    rows = np.concatenate([rows for rows, _ in pairs])
-    ids = np.concatenate([ids for _, ids in pairs])
-    both, count = np.unique(np.stack([rows, ids], axis=1), axis=0, return_counts=True)
-    both = both[np.argsort(-count, kind="stable")]
-    for column in (0, 1):
-        both = both[np.sort(np.unique(both[:, column], return_index=True)[1])]
-    return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
-
-
-def _spread(pixels: Array) -> float:
-    """Return the area of the ellipse with the covariance of (n, 2) pixels."""
-    return float(4.0 * np.pi * np.sqrt(max(np.linalg.det(np.cov(pixels.T, bias=True)), 0.0)))
-
-
-def _most_seen(group: list[_Place], landmark_ids: Index) -> int:
-    """Return the keyframe that sees most of some landmarks, the first of several."""
-    counts = [np.count_nonzero(np.isin(landmark_ids, p.landmark_ids)) for p in group]
-    return group[int(np.argmax(counts))].keyframe_id
