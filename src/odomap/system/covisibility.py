@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.maps.columns import grown
+from odomap.maps.map import Map
 
-__all__ = ["Acquaintance", "Covisibility", "growth_of"]
+__all__ = ["Acquaintance", "Covisibility", "acquaint"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -39,7 +40,7 @@ class Acquaintance(NamedTuple):
         num_shared: (n,) how many.
         parent: the keyframe it was placed against, −1 for the first.
         T_parent_keyframe: (4, 4).
-        growth: (6, 6) Q, NaN where unknown.
+        growth: (6, 6) Q, in its own units; NaN where unknown.
     """
 
     keyframe_id: int
@@ -56,6 +57,11 @@ class Covisibility:
     Args:
         least: landmarks that two keyframes must share to be neighbours.
         strong: landmarks that they must share to hold each other in place.
+
+    Attributes:
+        parent: (R,) by keyframe id, −1 for the root.
+        motion: (R, 4, 4) T_parent_keyframe by keyframe id, as it was.
+        growth: (R, 6, 6) by keyframe id, NaN where unknown.
     """
 
     def __init__(self, least: int, strong: int) -> None:
@@ -99,11 +105,18 @@ class Covisibility:
         """Forget a keyframe; its children go to its parent."""
         for other in self._shared.pop(keyframe_id):
             self._shared[other].pop(keyframe_id, None)
-        for child in np.flatnonzero(self.parent == keyframe_id).tolist():
-            Ad = se3_adjoint(se3_inverse(self.motion[child]))
-            self.growth[child] += Ad @ self.growth[keyframe_id] @ Ad.T
-            self.motion[child] = self.motion[keyframe_id] @ self.motion[child]
-            self.parent[child] = self.parent[keyframe_id]
+        children = np.flatnonzero(self.parent == keyframe_id).tolist()
+        holder = int(self.parent[keyframe_id])
+        T_holder, added = self.motion[keyframe_id], self.growth[keyframe_id]
+        if holder < 0 and children:  # the eldest child is the root from now on
+            holder, *children = children
+            T_holder = se3_inverse(self.motion[holder])
+            added = _carried(self.growth[holder], self.motion[holder])
+            self.parent[holder], self.growth[holder] = -1, np.nan
+        for child in children:
+            self.growth[child] += _carried(added, se3_inverse(self.motion[child]))
+            self.motion[child] = T_holder @ self.motion[child]
+            self.parent[child] = holder
 
     def neighbours(self, keyframe_id: int) -> Index:
         """Return the (n,) keyframes that share landmarks with one, most first, then oldest."""
@@ -120,12 +133,27 @@ class Covisibility:
         return self._pairs[: self._num_pairs].copy()
 
 
-def growth_of(
-    T_parent_keyframe: Array, covariance_parent: Array, covariance_keyframe: Array
-) -> Array:
-    """Return by what a keyframe is less sure than its parent, (6, 6), in its own tangent.
+def acquaint(map: Map, keyframe_id: int) -> Acquaintance:
+    """Read what is to be written down of a living keyframe.
 
-    It may be indefinite, as covariances that were found one by one need not fit together.
+    Its growth may be indefinite: covariances that were found one by one need not fit together.
     """
-    Ad = se3_adjoint(se3_inverse(T_parent_keyframe))
-    return np.asarray(covariance_keyframe - Ad @ covariance_parent @ Ad.T)
+    with map.lock:
+        shared, counts = map.covisible(keyframe_id)
+        parent, scale = map.parent(keyframe_id), map.scale(keyframe_id)
+        ends = [keyframe_id if parent < 0 else parent, keyframe_id]
+        Ts = map.Ts_world_body(ends)
+        of_parent, own = (map.covariance(k) for k in ends)
+    T = se3_inverse(Ts[0]) @ Ts[1]
+    if parent < 0:
+        growth = np.full((6, 6), np.nan)
+    else:
+        units = np.repeat([1.0 / scale, 1.0], 3)
+        growth = (own - _carried(of_parent, se3_inverse(T))) * units[:, None] * units
+    return Acquaintance(keyframe_id, shared, counts, parent, T, growth)
+
+
+def _carried(covariance: Array, T_to_from: Array) -> Array:
+    """Return a covariance (6, 6) of a tangent at one pose, of the tangent at another."""
+    Ad = se3_adjoint(T_to_from)
+    return np.asarray(Ad @ covariance @ Ad.T)

@@ -48,7 +48,7 @@ STEP_ANGLE = 0.005
 STEP_SCALE = 0.01
 """σ of the logarithm of its scale, which no covariance of the map tells."""
 LOOP_SCALE = 0.005
-"""σ of the logarithm of a measured loop's scale."""
+"""σ of the logarithm of a measured loop's scale, which edges of the map do not keep."""
 FLOOR = 0.05
 """No tree edge is surer than this share of what it would be if nobody told."""
 REPEATED = 2.0
@@ -64,7 +64,7 @@ class LoopEdges(NamedTuple):
         i, j: (L,) rows of the keyframes.
         Ts_i_j: (L, 4, 4) pose of j in i, in the units of i.
         scales_i_j: (L,) units of i per unit of j.
-        information: (L, 6, 6), right tangent.
+        information: (L, 6, 6), right tangent, in the units of i.
     """
 
     i: Index
@@ -195,7 +195,10 @@ def _graph(parts: Essentials, loops: LoopEdges, with_scale: bool) -> EssentialGr
     is_fixed = np.zeros(len(Ts), bool)
     is_fixed[parts.root] = True
     measured = _similar(loops.Ts_i_j, loops.scales_i_j, with_scale)
-    ties = _with_log_scale(loops.information, LOOP_SCALE**-2, with_scale)
+    units = np.ones((len(loops.i), 6))
+    units[:, :3] = loops.scales_i_j[:, None] if with_scale else 1.0  # tangents are those of j
+    ties = loops.information * units[:, :, None] * units[:, None, :]
+    ties = _with_log_scale(ties, LOOP_SCALE**-2, with_scale)
     return EssentialGraph(
         group,
         Ts,
