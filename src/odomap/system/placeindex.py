@@ -30,7 +30,7 @@ __all__ = ["PlaceIndex", "described"]
 Descriptors = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
-KEYFRAMES = 10
+KEYFRAMES = 8
 """Keyframes that compete, the most alike."""
 GROUP = 6
 """Keyframes of a place: one and those that share most landmarks with it."""

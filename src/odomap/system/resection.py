@@ -41,6 +41,8 @@ THRESHOLD_PX = 4.0
 """Largest error of an inlier on the finest level."""
 GUIDED_PX = 8.0
 """Radius in which landmarks are looked for once there is a pose."""
+SAMPLES = 300
+"""Most triples drawn: every fifth pair has to be right."""
 SPREAD = 0.05
 """Share of the image that the inliers must cover."""
 
@@ -140,6 +142,7 @@ class Resection:
             seed=seed,
             threshold_px=THRESHOLD_PX,
             sigma_px=view.sigma[rows],
+            max_iterations=SAMPLES,
             min_inliers=FEWEST,
         )
         if not start.converged:
@@ -170,15 +173,25 @@ class Resection:
         looks = np.concatenate([p.descriptors for p in group])[first]
         points, keypoints = self._map.points_world(ids), view.keypoints.astype(np.float32)
         grid = KeypointGrid.of(keypoints, (self._camera.height, self._camera.width))
-        anywhere = np.zeros(len(ids), np.int64), np.full(len(ids), 255, np.int64)
+        finest, coarsest = np.zeros(len(ids), np.int64), np.full(len(ids), 255, np.int64)
         radius, result = np.full(len(ids), GUIDED_PX), start
         for _ in range(2):
             T_camera_world = se3_inverse(np.asarray(result.T_world_camera.matrix))
             ahead = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
             guess = self._camera.project(ahead)
             guess[~self._camera.is_inside(guess)] = np.nan
-            features = view.descriptors, keypoints, view.levels, grid
-            found = match_projected(looks, guess, radius, *anywhere, *features, self._matching)
+            found = match_projected(
+                looks,
+                guess,
+                radius,
+                finest,
+                coarsest,
+                view.descriptors,
+                keypoints,
+                view.levels,
+                grid,
+                self._matching,
+            )
             seen = np.flatnonzero(found >= 0)
             rows = found[seen]
             result = refine_pose(
@@ -224,11 +237,13 @@ def _joined(matches: list[tuple[Index, Index]]) -> tuple[Index, Index]:
     """
     rows = np.concatenate([rows for rows, _ in matches])
     ids = np.concatenate([ids for _, ids in matches])
-    both, count = np.unique(np.stack([rows, ids], axis=1), axis=0, return_counts=True)
-    both = both[np.argsort(-count, kind="stable")]
-    for column in (0, 1):
-        both = both[np.sort(np.unique(both[:, column], return_index=True)[1])]
-    return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
+    stride = int(ids.max(initial=0)) + 1
+    both, count = np.unique(rows * stride + ids, return_counts=True)
+    rows, ids = np.divmod(both[np.argsort(-count, kind="stable")], stride)
+    first = np.sort(np.unique(rows, return_index=True)[1])
+    rows, ids = rows[first], ids[first]
+    first = np.sort(np.unique(ids, return_index=True)[1])
+    return rows[first], ids[first]
 
 
 def _spread(pixels: Array) -> float:
