@@ -381,7 +381,7 @@ def refine_alignment_into(
             damping, raise_by = max(0.1 * damping, 1e-12), 4.0
         else:
             damping, raise_by = damping * raise_by, 2.0 * raise_by
-        if decrement <= 1e-12 * (1.0 + cost):
+        if decrement <= 1e-6:
             return s, cost, True
     return s, cost, False
 

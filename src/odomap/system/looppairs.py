@@ -31,6 +31,7 @@ __all__ = [
     "FeatureNoise",
     "LoopPairs",
     "match_expected",
+    "match_group",
     "match_looks",
     "sights_of",
     "similarity_of",
@@ -96,19 +97,9 @@ def similarity_of(S: Alignment) -> Array:
     return T
 
 
-def match_looks(
-    newer: LoopSide, matched: LoopSide, matching: MatchConfig, *, known: bool = True
-) -> LoopPairs:
-    """Pair features of both keyframes by how they look: by words, or all with all without words.
-
-    Args:
-        newer: the keyframe that came back.
-        matched: the one it may have come back to; of its features those with landmarks count.
-        matching: how descriptors are compared.
-        known: whether the newer's features must have landmarks too.
-    """
-    first = np.flatnonzero((newer.landmark_of >= 0) | (not known))
-    second = np.flatnonzero(matched.landmark_of >= 0)
+def match_looks(newer: LoopSide, matched: LoopSide, matching: MatchConfig) -> LoopPairs:
+    """Pair features of both keyframes that have landmarks: by words, or all with all without."""
+    first, second = (np.flatnonzero(side.landmark_of >= 0) for side in (newer, matched))
     looks = newer.descriptors[first], matched.descriptors[second]
     if newer.nodes is not None and matched.nodes is not None:
         found = match_words(looks[0], newer.nodes[first], looks[1], matched.nodes[second], matching)
@@ -116,6 +107,14 @@ def match_looks(
         found = _match_all(*looks, matching)
     first, second = first[found >= 0], second[found[found >= 0]]
     return LoopPairs(first, newer.landmark_of[first], second, matched.landmark_of[second])
+
+
+def match_group(newer: LoopSide, matched: LoopSide, matching: MatchConfig) -> LoopPairs:
+    """Pair all features of the newer keyframe with all landmarks of the matched one's group."""
+    found = _match_all(newer.descriptors, matched.landmark_descriptors, matching)
+    i = np.flatnonzero(found >= 0)
+    b = found[i]
+    return LoopPairs(i, newer.landmark_of[i], matched.feature_of[b], b)
 
 
 def _match_all(first: NDArray[np.uint8], second: NDArray[np.uint8], matching: MatchConfig) -> Index:

@@ -33,6 +33,7 @@ from odomap.system.looppairs import (
     FeatureNoise,
     LoopPairs,
     match_expected,
+    match_group,
     match_looks,
     sights_of,
     similarity_of,
@@ -188,7 +189,7 @@ class _Search:
         found = solve_alignment(sights, self.with_scale, self.seed, gate, confidence, iterations)
         if found.num_inliers >= config.first_inliers:
             return refine_alignment(sights, found, self.with_scale, gate, config.huber)
-        more = match_looks(newer, matched, self.matching, known=False)
+        more = match_group(newer, matched, self.matching)
         if len(more) < config.min_matches:
             return f"{len(more)} matches of {config.min_matches} needed"
         seen = self._resected(newer, matched, more, noise)
