@@ -22,6 +22,7 @@ from odomap.system.association import (
 )
 from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
+from odomap.system.closing import ClosingConfig
 from odomap.system.creating import CreateConfig
 from odomap.system.culling import CullConfig
 from odomap.system.fusing import FuseConfig
@@ -85,6 +86,8 @@ class Config:
     """Which matches become landmarks."""
     culling: CullConfig = field(default_factory=CullConfig)
     """What goes from the map."""
+    closing: ClosingConfig = field(default_factory=ClosingConfig)
+    """When loops are looked for, and closed."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 

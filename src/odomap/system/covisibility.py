@@ -133,17 +133,23 @@ class Covisibility:
         return self._pairs[: self._num_pairs].copy()
 
 
-def acquaint(map: Map, keyframe_id: int) -> Acquaintance:
+def acquaint(map: Map, keyframe_id: int, of_parent: Array | None = None) -> Acquaintance:
     """Read what is to be written down of a living keyframe.
 
     Its growth may be indefinite: covariances that were found one by one need not fit together.
+
+    Args:
+        map: the map.
+        keyframe_id: the keyframe.
+        of_parent: (6, 6) covariance of its parent when its own was found; default the present one.
     """
     with map.lock:
         shared, counts = map.covisible(keyframe_id)
         parent, scale = map.parent(keyframe_id), map.scale(keyframe_id)
         ends = [keyframe_id if parent < 0 else parent, keyframe_id]
         Ts = map.Ts_world_body(ends)
-        of_parent, own = (map.covariance(k) for k in ends)
+        now, own = (map.covariance(k) for k in ends)
+        of_parent = now if of_parent is None else of_parent
     T = se3_inverse(Ts[0]) @ Ts[1]
     if parent < 0:
         growth = np.full((6, 6), np.nan)

@@ -1,10 +1,10 @@
 """The essential graph: a path is corrected by a loop through few edges that say all.
 
 What ties keyframes together are thousands of landmarks, but where a loop bends the path a graph of
-poses tells enough (ORB-SLAM, VII-D). Its edges are relative placements S_i⁻¹ S_j of
+poses tells enough. Its edges are relative placements S_i⁻¹ S_j of
 
     tree          each keyframe and its parent, as they are now; as unsure as odometry was between
-    covisibility  two keyframes that share many landmarks, as they are now: no tearing apart
+    covisibility  keyframes of two branches that share many landmarks, as they are now
     loop          as measured when it was closed, never as it is now
 
 S is of SE(3), or of Sim(3) for a single camera, which loses its scale on the way. A new loop is
@@ -13,8 +13,9 @@ loops. Then all edges give the poses; marginals of tree and loops say how sure t
 
     Σ_k = (H⁻¹)_kk + Ad(T_k_root) Σ_root Ad(T_k_root)ᵀ,
 
-without the covisibility edges, which say again what the tree says. With no loop that is what
-odometry claimed; with one it is less.
+without the covisibility edges, which hold branches together but measured nothing new. With no loop
+that is what odometry claimed; with one it is less. Covisible keyframes of one branch have no edge,
+unlike in the paper: it would say again what the tree says, and stiffen the path against the loop.
 
 Cost: a handful of sparse factorisations, O(K^1.5).
 
@@ -51,8 +52,8 @@ LOOP_SCALE = 0.005
 """σ of the logarithm of a measured loop's scale, which edges of the map do not keep."""
 FLOOR = 0.05
 """No tree edge is surer than this share of what it would be if nobody told."""
-REPEATED = 2.0
-"""Factor on the variance of a covisibility edge against that of a step of the tree."""
+FAR = 10
+"""Steps of the tree within which covisibility says nothing that the tree does not say."""
 ITERATIONS = 20
 """Steps that the last solution takes at most; those before have brought it near."""
 
@@ -213,22 +214,34 @@ def _graph(parts: Essentials, loops: LoopEdges, with_scale: bool) -> EssentialGr
 
 def _with_covisibility(graph: EssentialGraph, parts: Essentials) -> EssentialGraph:
     """Return the graph with its covisibility edges, last, as the map places them now."""
-    with_scale = graph.group == "Sim3"
-    i, j = parts.pairs.T
-    Ts = _similar(parts.Ts_world_body, parts.scales, with_scale)
-    ties = np.zeros((len(Ts), graph.dim, graph.dim))
+    i, j = parts.pairs[_is_across(parts)].T
     is_step = ~graph.is_doubted
-    ties[graph.second[is_step]] = graph.information[is_step]
-    is_tree = (parts.parent[j] == i) | (parts.parent[i] == j) | (parts.parent[j] < 0)
-    i, j = i[~is_tree], j[~is_tree]
+    steps = np.zeros((graph.num_nodes, graph.dim, graph.dim))
+    steps[graph.second[is_step]] = graph.information[is_step]
+    with_scale = graph.group == "Sim3"
+    Ts = _similar(parts.Ts_world_body, parts.scales, with_scale)
     return replace(
         graph,
         first=np.concatenate([graph.first, i]),
         second=np.concatenate([graph.second, j]),
         Ts_first_second=np.concatenate([graph.Ts_first_second, _between(Ts, i, j, with_scale)]),
-        information=np.concatenate([graph.information, ties[j] / REPEATED]),
+        information=np.concatenate([graph.information, steps[j]]),
         is_doubted=np.concatenate([graph.is_doubted, np.zeros(len(i), bool)]),
     )
+
+
+def _is_across(parts: Essentials) -> Bool:
+    """Say which pairs (C,) of keyframes are in different branches of the tree.
+
+    The way from one to the other leads over their nearest common ancestor; parents are older.
+    """
+    i, j = parts.pairs.T
+    is_other = parts.parent[j] >= 0
+    for _ in range(FAR):
+        low, high = np.minimum(i, j), np.maximum(i, j)
+        up = np.where((low == high) | (parts.parent[high] < 0), high, parts.parent[high])
+        i, j = low, up
+    return np.asarray(is_other & (i != j))
 
 
 def _step_information(parts: Essentials, steps: Array, child: Index, with_scale: bool) -> Array:

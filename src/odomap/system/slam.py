@@ -8,7 +8,8 @@
 
 The tracker places every frame; each new keyframe is given to local mapping, which completes,
 adjusts and thins the map around it, in a thread of its own unless the rhythm is "inline". Unlike
-an odometry's, the map is kept: what was seen before is found again, and used.
+an odometry's, the map is kept: what was seen before is found again, and used. Where the path has
+drifted too far for that, the closer recognises the place by its words, and corrects the path.
 
 Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
 T-RO 2015; Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017.
@@ -18,8 +19,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from odomap.errors import ConfigError
+from odomap.files.vocabulary import Vocabulary
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
+from odomap.system.closing import LoopCloser, SideVerifier
 from odomap.system.config import Config, make_association, preset, preset_for
 from odomap.system.keyframetracking import KeyframeTracker
 from odomap.system.keyframing import Keyframes
@@ -31,6 +34,7 @@ from odomap.system.recognition import Recognizer
 from odomap.system.stages import Stages
 from odomap.system.starting import make_start
 from odomap.system.visual import Sight, VisualSystem
+from odomap.vision.vocabulary import VocabularyTree
 
 __all__ = ["Slam"]
 
@@ -44,10 +48,12 @@ class Slam(VisualSystem):
         rhythm: which thread runs what; see `rhythms`.
         map: a map to go on with; default a new one.
         is_mapping: whether the map is changed; if not, frames are only placed in it.
+        vocabulary: makes the words by which places are recognised; default that which comes with
+            odomap, read where loops are looked for (`closing.enabled`).
 
     Attributes:
         map: keyframes and landmarks.
-        worker: runs the stages; its lists of observers are told of estimates and keyframes.
+        worker: runs the stages; its lists of observers are told of estimates, keyframes and loops.
 
     Raises:
         CalibrationError: the rig does not carry what the configuration says.
@@ -61,9 +67,10 @@ class Slam(VisualSystem):
         rhythm: str = "inline",
         map: Map | None = None,
         is_mapping: bool = True,
+        vocabulary: VocabularyTree | None = None,
     ) -> None:
         config = preset(preset_for(rig)) if config is None else config
-        self._is_mapping = is_mapping
+        self._is_mapping, self._vocabulary = is_mapping, vocabulary
         super().__init__(Sight.of(rig, config), config, rhythm, map)
 
     def _stages(self, sight: Sight, config: Config) -> Stages:
@@ -96,11 +103,27 @@ class Slam(VisualSystem):
         )
         depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
         sections = _sections(config)
-        self._mapper = LocalMapper(
+        self._mapper = _Mapper(
             self.map, eye.camera, eye.T_body_camera, sections, bias, *depth, ranger is not None
         )
-        mapper = self._mapper if self._is_mapping else None
-        return Stages(self.map, self._tracker, mapper)
+        if not self._is_mapping:
+            return Stages(self.map, self._tracker)
+        closer = self._closer(sight, sections, config) if config.closing.enabled else None
+        return Stages(self.map, self._tracker, self._mapper, closer)
+
+    def _closer(self, sight: Sight, sections: MappingSections, config: Config) -> LoopCloser:
+        eye, with_scale = sight.eye, sight.ranger is None
+        verifier = SideVerifier(
+            eye.camera,
+            eye.T_body_camera,
+            sections.sigma_px,
+            sections.level_scale,
+            with_scale,
+            sections.matching,
+        )
+        words = Vocabulary.load() if self._vocabulary is None else self._vocabulary
+        forget = self._mapper.forget_drifts
+        return LoopCloser(self.map, words, verifier, with_scale, config.closing, on_closed=forget)
 
     @property
     def _path(self) -> Path:
@@ -108,6 +131,14 @@ class Slam(VisualSystem):
 
     def _counts(self) -> Mapping[str, int]:
         return dict(self._mapper.counts)
+
+
+class _Mapper(LocalMapper):
+    """A mapper whose keyframes' uncertainty can be counted from the map's anew."""
+
+    def forget_drifts(self) -> None:
+        """Begin with what the map says of how sure keyframes are: a loop has made them surer."""
+        self._drifts.clear()
 
 
 def _sections(config: Config) -> MappingSections:

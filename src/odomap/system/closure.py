@@ -1,0 +1,189 @@
+"""A loop closed: what is read off the map for it, and what is written into it.
+
+Reading takes a few numbers of every keyframe (`Essentials`). A keyframe that was culled is a stub
+below its parent; where a loop was measured to one, the edge goes to the parent,
+
+    S_p_q = (S_p⁻¹ S_i) Z_ij (S_j⁻¹ S_q),
+
+and says the same. Writing moves each keyframe by its correction, S ← S_corrected S_read⁻¹ S_now.
+Keyframes that came since follow their parents (`maps/writing`), and are as much surer as these are:
+Σ = Ad Σ_parent Adᵀ + Q, their growth Q staying what odometry said it was. At last landmarks of both
+sides that are one point are fused, and what either side shows of the other's is observed.
+
+Cost: O(K) over some numbers per keyframe, and O(landmarks fused).
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015, section VII-C (loop fusion).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.maps.map import Map
+from odomap.maps.snapshot import Update
+from odomap.maps.states import compose, inverse
+from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
+from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
+from odomap.system.verifying import Verified
+
+__all__ = ["LOOP", "Closure", "carry_covariance", "read_essentials"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LOOP = "loop"
+"""Kind of the edges in the map that loops leave."""
+
+
+def read_essentials(map: Map, known: Covisibility) -> Essentials:
+    """Read what an essential graph is made of.
+
+    Args:
+        map: the map.
+        known: what was written down of all its living keyframes.
+    """
+    with map.lock:
+        snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
+        ids = snapshot.keyframe_ids
+        covariances = map.states.covariances[ids]
+        loops = _read_loops(map, ids)
+    parent = known.parent[ids]
+    row = np.searchsorted(ids, parent)
+    row[parent < 0] = -1
+    pairs = known.pairs()
+    pairs = pairs[np.isin(pairs, ids).all(axis=1)]
+    return Essentials(
+        ids,
+        snapshot.Ts_world_body,
+        snapshot.scales,
+        covariances,
+        row,
+        known.growth[ids],
+        np.searchsorted(ids, pairs),
+        loops,
+        snapshot.version,
+    )
+
+
+def _read_loops(map: Map, alive: Index) -> LoopEdges:
+    """Return the loops closed before, between living keyframes, by rows of these."""
+    edges = map.edges()
+    chosen = np.flatnonzero(np.array(edges.kind, str) == LOOP)
+    ends = edges.i[chosen], edges.j[chosen]
+    (p, T_p_i), (q, T_q_j) = (_held(map, end) for end in ends)
+    D = inverse(T_q_j)
+    Ts, scales = compose(compose(T_p_i, (edges.Ts_i_j[chosen], edges.scales_i_j[chosen])), D)
+    Ad = se3_adjoint(D[0])
+    information = np.swapaxes(Ad, 1, 2) @ edges.information[chosen] @ Ad
+    is_one = p == q  # both ends have come to hang from one keyframe: nothing is left to say
+    kept = [x[~is_one] for x in (p, q, Ts, scales, information)]
+    return LoopEdges(*(np.searchsorted(alive, ids) for ids in kept[:2]), *kept[2:])
+
+
+def _held(map: Map, ids: Index) -> tuple[Index, tuple[Array, Array]]:
+    """Return the living keyframes (n,) that hold keyframes or stubs, and these in them."""
+    holders = [k if map.is_keyframe_alive(k) else map.parent(k) for k in ids.tolist()]
+    (Ts, scales), (Ts_held, held) = (
+        (map.Ts_world_body(each), np.array([map.scale(k) for k in each]))
+        for each in (holders, ids.tolist())
+    )
+    return np.array(holders, np.int64), compose(inverse((Ts, scales)), (Ts_held, held))
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """A loop that is believed, and what the path becomes by it.
+
+    Attributes:
+        keyframe_id: the keyframe that came back.
+        matched_id: the keyframe it came back to.
+        measured: what geometry says of the two.
+        before: the path that was read.
+        after: the path corrected.
+    """
+
+    keyframe_id: int
+    matched_id: int
+    measured: Verified
+    before: Essentials
+    after: Corrected
+
+    def write(self, map: Map, known: Covisibility) -> dict[int, Array]:
+        """Move the keyframes, fuse what is one, and keep the measurement.
+
+        Args:
+            map: the map as it is now.
+            known: keyframes that are not in it have come since.
+
+        Returns:
+            Of those how sure their parents were before: what a mapper that began before finds out
+            about how sure they are is relative to that.
+        """
+        ids = map.keyframe_ids
+        came = [acquaint(map, k) for k in ids[~np.isin(ids, known.keyframe_ids)].tolist()]
+        were = {k.keyframe_id: map.covariance(k.parent) for k in came if k.parent >= 0}
+        map.apply(self._update(map))
+        for keyframe in came:
+            carry_covariance(map, keyframe)
+        self._fuse(map)
+        found = self.measured
+        map.add_edge(
+            self.matched_id,
+            self.keyframe_id,
+            found.T_matched_keyframe,
+            found.information,
+            LOOP,
+            scale_i_j=found.scale,
+        )
+        return were
+
+    def _update(self, map: Map) -> Update:
+        """Return the correction, applied to where keyframes are now."""
+        before, after = self.before, self.after
+        now = map.snapshot(before.keyframe_ids, landmarks=False)
+        row = np.searchsorted(before.keyframe_ids, now.keyframe_ids)
+        read = before.Ts_world_body[row], before.scales[row]
+        moved = compose((after.Ts_world_body[row], after.scales[row]), inverse(read))
+        Ts, scales = compose(moved, (now.Ts_world_body, now.scales))
+        root = int(before.keyframe_ids[before.root])
+        return Update(
+            anchor_id=root,
+            T_world_anchor=map.T_world_body(root),
+            keyframe_ids=now.keyframe_ids,
+            Ts_world_body=Ts,
+            landmark_ids=np.zeros(0, np.int64),
+            points_world=np.zeros((0, 3)),
+            version=before.version,
+            scales=scales,
+            scale_anchor=map.scale(root),
+            covariances=None if after.covariances is None else after.covariances[row],
+        )
+
+    def _fuse(self, map: Map) -> None:
+        """Join landmarks of both sides that are one point, and observe what either side shows."""
+        found = self.measured
+        map.fuse_landmarks(found.pairs[:, 1], found.pairs[:, 0])
+        for k, seen in (
+            (self.keyframe_id, found.seen_by_newer),
+            (self.matched_id, found.seen_by_matched),
+        ):
+            ids, taken = map.observations_of(k)
+            is_free = ~np.isin(seen[:, 0], taken) & ~np.isin(map.resolve(seen[:, 1]), ids)
+            map.add_observations(k, seen[is_free, 1], seen[is_free, 0])
+
+
+def carry_covariance(map: Map, keyframe: Acquaintance) -> None:
+    """Make a keyframe as sure as its parent is now, but for what odometry added since."""
+    growth = keyframe.growth
+    covariance = (
+        map.covariance(keyframe.parent) if keyframe.parent >= 0 else np.full((6, 6), np.nan)
+    )
+    if not (np.isfinite(growth).all() and np.isfinite(covariance).all()):
+        return
+    values, axes = np.linalg.eigh(0.5 * (growth + growth.T))
+    added = (axes * np.maximum(values, 0.0)) @ axes.T
+    Ad = se3_adjoint(se3_inverse(keyframe.T_parent_keyframe))
+    map.set_covariance([keyframe.keyframe_id], Ad @ covariance @ Ad.T + added)
