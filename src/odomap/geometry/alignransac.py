@@ -5,7 +5,9 @@ a scale of its own, and each sees some of them. Three pairs of points give the s
 to the other in closed form (Horn); RANSAC finds one that most pairs agree with in both images; and
 Levenberg-Marquardt minimises, over what both have seen,
 
-    Σ ρ(|x - π(S⁻¹ q)|² / σ_x²) + ρ(|y - π(S p)|² / σ_y²),      S = (R, t, s).
+    Σ ρ(|x - π(S⁻¹ q)|² / σ_x²) + ρ(|y - π(S p)|² / σ_y²),      S = (R, t, s),
+
+and the errors of log depth where s is sought: of two cameras in one place they alone tell it.
 
 The covariance does not believe σ alone. Where points were mapped from the very pixels they are
 compared with, the two halves of a pair are one measurement told twice; and points have errors of
@@ -29,6 +31,9 @@ from odomap.geometry.so3 import Array
 __all__ = ["Alignment", "PairSights", "refine_alignment", "solve_alignment"]
 
 Bools = NDArray[np.bool_]
+
+LEAST_DEPTH = 1e-3
+"""Relative error of depths that are believed no better, at the median of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +144,7 @@ def refine_alignment(
     with_scale: bool,
     gate: float = 9.21,
     huber: float = 2.5,
-    max_iterations: int = 15,
+    max_iterations: int = 30,
 ) -> Alignment:
     """Minimise the errors in both images from a good start, then without what is far off.
 
@@ -166,13 +171,32 @@ def refine_alignment(
         score_alignment(R, t, scale, *_columns(sights), allowed, inliers)
         used = sights.at(inliers)
         scale, _, converged = refine_alignment_into(
-            *(R, t, scale, *_columns(used), huber, with_scale, max_iterations, H, M)
+            *(R, t, scale, *_columns(used), _depth_weights(used, R, t, scale, with_scale)),
+            *(huber, with_scale, max_iterations, H, M),
         )
     score_alignment(R, t, scale, *_columns(sights), gate, inliers)
     covariance = _covariance(H, M, scale, with_scale, len(used)) if converged else None
     if covariance is None:
         covariance, converged = np.full((7, 7), np.inf), False
     return Alignment(_pose(R, t), scale, inliers, covariance, converged)
+
+
+def _depth_weights(s: PairSights, R: Array, t: Array, scale: float, with_scale: bool) -> Array:
+    """Return (N,) inverse variances of log depths: errors grow with depth, by as much as they do.
+
+    Where the scale is known depths are left out: pixels say more.
+    """
+    weights = np.zeros(len(s))
+    rows = np.flatnonzero((s.wx > 0) & (s.wy > 0))
+    if not with_scale or len(rows) < 3:
+        return weights
+    depth, other = s.q[rows, 2], scale * (s.p[rows] @ R[2]) + t[2]
+    rows, depth, other = (a[(depth > 0) & (other > 0)] for a in (rows, depth, other))
+    if len(rows) >= 3:
+        off = np.log(other / depth) / depth
+        sigma = 1.4826 * np.median(np.abs(off - np.median(off)))
+        weights[rows] = 1.0 / (max(float(sigma), LEAST_DEPTH / np.median(depth)) * depth) ** 2
+    return weights
 
 
 def _columns(s: PairSights) -> tuple[Array, Array, Array, Array, Array, Array]:

@@ -6,7 +6,9 @@ in the one image and at y in the other, on the plane z = 1. Both sides count,
     e = x - π(Rᵀ (q - t) / s),     f = y - π(s R p + t),
 
 each with a weight (inverse variance) of its own; where a point is known or seen by one side only,
-the other half has weight 0. For (R, t, s) ⊞ (ρ, φ, λ) = (R exp φ, t + R ρ, s e^λ) points move by
+the other half has weight 0. Two cameras in one place say nothing of s by that: where the scale is
+sought, depths count as well, log q_z - log (s R p + t)_z. For (R, t, s) ⊞ (ρ, φ, λ) =
+(R exp φ, t + R ρ, s e^λ) points move by
 
     d(s R p + t) = R (ρ - s p^ φ + s λ p),     dz = -ρ/s + z^ φ - λ z   at z = Rᵀ (q - t) / s.
 
@@ -40,6 +42,8 @@ Bools = NDArray[np.bool_]
 
 _NEAREST = 1e-9
 """Depth below which a point is not in front of a camera."""
+LEAST_STEP = 0.01
+"""Steps smaller than this, in standard deviations of the alignment, change nothing that matters."""
 _BEHIND = 1e6
 """Cost of a point behind a camera: a step that puts one there is refused."""
 
@@ -242,15 +246,17 @@ def gather_alignment(
     q: Array,
     y: Array,
     wy: Array,
+    wd: Array,
     huber: float,
     with_scale: bool,
     H: Array,
     g: Array,
     M: Array,
 ) -> float:
-    """H = Σ w ρ' JᵀJ, g = Σ g_i with g_i = Σ w ρ' Jᵀr of both halves, M = Σ g_i g_iᵀ; returns Σ ρ.
+    """H = Σ w ρ' JᵀJ, g = Σ g_i with g_i = Σ w ρ' Jᵀr of a pair, M = Σ g_i g_iᵀ; returns Σ ρ.
 
-    (7, 7), (7,), (7, 7); without scale the last row is that of the identity.
+    `wd` are inverse variances of log depths, 0 for none. (7, 7), (7,), (7, 7); without scale the
+    last row is that of the identity.
     """
     J, r, one, weight = np.zeros((2, 7)), np.zeros(2), np.zeros(7), np.zeros(2)
     for a in range(7):
@@ -309,6 +315,20 @@ def gather_alignment(
                 one[k] += w * (J[0, k] * r[0] + J[1, k] * r[1])
                 for m in range(k + 1):
                     H[k, m] += w * (J[0, k] * J[0, m] + J[1, k] * J[1, m])
+            if half == 0 or not wd[i] > 0.0:
+                continue
+            deeper, w = np.log(Z / q[i, 2]), wd[i]
+            r2 = w * deeper * deeper
+            if r2 <= huber * huber:
+                cost += r2
+            else:
+                cost += 2.0 * huber * np.sqrt(r2) - huber * huber
+                w *= huber / np.sqrt(r2)
+            w /= Z
+            for k in range(d):
+                one[k] += w * D[2, k] * deeper
+                for m in range(k + 1):
+                    H[k, m] += w / Z * D[2, k] * D[2, m]
         for k in range(d):
             g[k] += one[k]
             for m in range(d):
@@ -332,6 +352,7 @@ def refine_alignment_into(
     q: Array,
     y: Array,
     wy: Array,
+    wd: Array,
     huber: float,
     with_scale: bool,
     max_iterations: int,
@@ -345,7 +366,7 @@ def refine_alignment_into(
     g, step, A, h = np.zeros(7), np.zeros(7), np.zeros((7, 7)), np.zeros(7)
     R_new, t_new, E = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     H_new, M_new = np.zeros((7, 7)), np.zeros((7, 7))
-    cost = gather_alignment(R, t, s, p, x, wx, q, y, wy, huber, with_scale, H, g, M)
+    cost = gather_alignment(R, t, s, p, x, wx, q, y, wy, wd, huber, with_scale, H, g, M)
     damping, raise_by = 1e-5, 4.0
     for _ in range(max_iterations):
         for a in range(7):
@@ -363,7 +384,7 @@ def refine_alignment_into(
         so3_orthonormalize_into(R_new, R_new)
         s_new = s * np.exp(step[6])
         new = gather_alignment(
-            *(R_new, t_new, s_new, p, x, wx, q, y, wy, huber, with_scale, H_new, h, M_new)
+            *(R_new, t_new, s_new, p, x, wx, q, y, wy, wd, huber, with_scale, H_new, h, M_new)
         )
         decrement = 0.0  # square of the step in standard deviations
         for a in range(7):
@@ -381,7 +402,7 @@ def refine_alignment_into(
             damping, raise_by = max(0.1 * damping, 1e-12), 4.0
         else:
             damping, raise_by = damping * raise_by, 2.0 * raise_by
-        if decrement <= 1e-6:
+        if decrement <= LEAST_STEP * LEAST_STEP:
             return s, cost, True
     return s, cost, False
 
@@ -394,4 +415,4 @@ def warm_up() -> None:
     R, t, H, M = np.eye(3), np.zeros(3), np.zeros((7, 7)), np.zeros((7, 7))
     inliers, samples = np.zeros(5, np.bool_), np.array([[0, 1, 2]])
     search_alignment(samples, p, x, w, p, x, w, 1.0, 0.99, True, R, t, inliers)
-    refine_alignment_into(R, t, 1.0, p, x, w, p, x, w, 2.0, True, 2, H, M)
+    refine_alignment_into(R, t, 1.0, p, x, w, p, x, w, w, 2.0, True, 2, H, M)

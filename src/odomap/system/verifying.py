@@ -60,11 +60,11 @@ class VerifyConfig:
     """Pairs of landmarks that must look alike for geometry to be asked."""
     first_inliers: Count = 8
     """Of them those that must agree for more to be looked for."""
-    min_inliers: Count = 25
+    min_inliers: Count = 30
     """Points that must agree at last."""
-    spread: Fraction = 0.04
+    spread: Fraction = 0.05
     """Share of each image that they must cover: the ellipse with the pixels' covariance."""
-    share: Fraction = 0.12
+    share: Fraction = 0.15
     """Least part of the landmarks expected to show that must agree."""
     ransac_iterations: Count = 300
     """Samples at most."""
