@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.maps.keyframes import Keyframe
@@ -92,8 +93,15 @@ def room():
     return room, *room.map(room.ring(24))
 
 
-def recognizer(m, min_inliers=30):
-    return Recognizer(m, CAMERA, T_BODY_CAMERA, MatchConfig(), min_inliers)
+@pytest.fixture(scope="module", params=["words", "looks"])
+def vocabulary(request):
+    """Return what keyframes are found by: words, or None to compare all."""
+    return Vocabulary.load() if request.param == "words" else None
+
+
+def recognizer(m, min_inliers=30, vocabulary=None):
+    config = MatchConfig()
+    return Recognizer(m, CAMERA, T_BODY_CAMERA, config, min_inliers, vocabulary=vocabulary)
 
 
 def error(T, truth):
@@ -102,12 +110,12 @@ def error(T, truth):
     return float(np.linalg.norm(E[:3, 3])), float(np.degrees(angle))
 
 
-def test_views_between_the_keyframes_are_found_where_they_were_taken(room):
+def test_views_between_the_keyframes_are_found_where_they_were_taken(room, vocabulary):
     world, m, ids = room
     for n in range(8):
         truth = world.pose((0.7 * np.cos(n), -0.9 * np.sin(n)), 0.8 * n)
         looks, pixels, levels, rows = world.view(truth)
-        found = recognizer(m).find(looks, pixels, levels, seed=n)
+        found = recognizer(m, vocabulary=vocabulary).find(looks, pixels, levels, seed=n)
         metres, degrees = error(found.T_world_camera, truth)
         assert metres < 0.03
         assert degrees < 0.3
@@ -124,32 +132,34 @@ def test_views_between_the_keyframes_are_found_where_they_were_taken(room):
         assert (sigma < 0.02).all()
 
 
-def test_same_view_and_seed_same_bytes(room):
+def test_same_view_and_seed_same_bytes(room, vocabulary):
     world, m, _ = room
     looks, pixels, levels, _ = world.view(world.pose((0.3, 0.2), 2.0))
-    a, b = (recognizer(m).find(looks, pixels, levels, seed=5) for _ in range(2))
+    a, b = (
+        recognizer(m, vocabulary=vocabulary).find(looks, pixels, levels, seed=5) for _ in range(2)
+    )
     assert a.T_world_camera.tobytes() == b.T_world_camera.tobytes()
     assert a.rows.tobytes() == b.rows.tobytes()
 
 
-def test_another_room_is_not_recognised(room):
+def test_another_room_is_not_recognised(room, vocabulary):
     _, m, _ = room
     for seed in range(1, 4):
         other = Room(seed)
         looks, pixels, levels, _ = other.view(other.pose((0.3, 0.2), 2.0))
-        said = recognizer(m).find(looks, pixels, levels, seed=seed)
+        said = recognizer(m, vocabulary=vocabulary).find(looks, pixels, levels, seed=seed)
         assert isinstance(said, str)
         assert "24 of 24 keyframes compared" in said
 
 
-def test_a_poster_seen_elsewhere_is_no_place():
+def test_a_poster_seen_elsewhere_is_no_place(vocabulary):
     """What agrees with a pose in one corner of the image alone proves nothing."""
     world = Room(3, 6000)
     m, _ = world.map(world.ring(6))
-    looks, pixels, levels, rows = world.view(world.ring(6)[1], noise_px=0.3)
+    looks, pixels, levels, rows = world.view(world.ring(6)[1], bits=3, noise_px=0.3)
     poster = (rows >= 0) & (np.abs(pixels - [200, 200]) < 50).all(axis=1)
     assert poster.sum() > 12
-    said = recognizer(m, 10).find(looks[poster], pixels[poster], levels[poster], seed=0)
+    said = recognizer(m, 10, vocabulary).find(looks[poster], pixels[poster], levels[poster], seed=0)
     assert isinstance(said, str)
     assert "% of the image" in said
 
@@ -176,20 +186,24 @@ def test_a_guess_puts_the_near_keyframes_first(room):
     assert found.keyframe_id in (1, 2, 3)
 
 
-def test_too_little_to_see_and_maps_without_places_are_said():
+def test_too_little_to_see_and_maps_without_places_are_said(vocabulary):
     looks = np.zeros((100, 32), np.uint8)
     pixels = np.zeros((100, 2))
     m = Map()
     assert not describes_places(m)
-    assert "no keyframe" in recognizer(m).find(looks, pixels, looks[:, 0], seed=0)
+    assert "no keyframe" in recognizer(m, vocabulary=vocabulary).find(
+        looks, pixels, looks[:, 0], seed=0
+    )
     m.add_keyframe(Keyframe(m.new_keyframe_id(), 0), np.eye(4))
     assert not describes_places(m)
-    assert "no keyframe" in recognizer(m).find(looks, pixels, looks[:, 0], seed=0)
-    said = recognizer(m).find(looks[:7], pixels[:7], looks[:7, 0], seed=0)
+    assert "no keyframe" in recognizer(m, vocabulary=vocabulary).find(
+        looks, pixels, looks[:, 0], seed=0
+    )
+    said = recognizer(m, vocabulary=vocabulary).find(looks[:7], pixels[:7], looks[:7, 0], seed=0)
     assert said.startswith("7 features of 30 needed")
 
 
-def test_fused_removed_and_culled_things_do_not_disturb():
+def test_fused_removed_and_culled_things_do_not_disturb(vocabulary):
     world = Room(7, 900)
     m, ids = world.map(world.ring(12))
     assert describes_places(m)
@@ -199,7 +213,35 @@ def test_fused_removed_and_culled_things_do_not_disturb():
     m.cull_keyframes([2, 3])
     truth = world.pose((0.1, -0.2), 1.0)
     looks, pixels, levels, _ = world.view(truth)
-    found = recognizer(m).find(looks, pixels, levels, seed=1)
+    found = recognizer(m, vocabulary=vocabulary).find(looks, pixels, levels, seed=1)
     assert error(found.T_world_camera, truth)[0] < 0.05
     assert m.is_alive(found.landmark_ids).all()
     assert found.keyframe_id not in (2, 3)
+
+
+def test_a_map_that_grows_and_shrinks_is_followed():
+    """Keyframes are recognised as soon as they are there, and no longer when they are gone."""
+    world = Room(5)
+    whole, ids = world.map(world.ring(12))
+    m = Map()
+    finder = recognizer(m, vocabulary=Vocabulary.load())
+    truth = world.ring(12)[4]
+    view = world.view(truth)[:3]
+    assert "no keyframe" in finder.find(*view, seed=0)
+    new = np.full(ids.max() + 1, -1)
+    for k in range(12):
+        T, (seen, rows) = whole.T_world_body(k), whole.observations_of(k)
+        m.add_keyframe(
+            Keyframe(m.new_keyframe_id(), 10**8 * k, features=whole.keyframe(k).features), T
+        )
+        fresh = seen[new[seen] < 0]
+        p = (whole.points_world(fresh) - T[:3, 3]) @ T[:3, :3]
+        new[fresh] = m.add_landmarks(k, p, np.zeros((len(p), 32), np.uint8))
+        m.add_observations(k, new[seen], rows)
+        finder.keep_up()
+    found = finder.find(*view, seed=0)
+    assert error(found.T_world_camera, truth)[0] < 0.03
+    m.cull_keyframes([k for k in range(12) if k not in (10, 11)])
+    said = finder.find(*view, seed=0)
+    assert isinstance(said, str)
+    assert "2 of 2 keyframes compared" in said
