@@ -64,7 +64,7 @@ class VerifyConfig:
     """Points that must agree at last."""
     spread: Fraction = 0.05
     """Share of each image that they must cover: the ellipse with the pixels' covariance."""
-    share: Fraction = 0.15
+    share: Fraction = 0.2
     """Least part of the landmarks expected to show that must agree."""
     ransac_iterations: Count = 300
     """Samples at most."""
