@@ -35,7 +35,7 @@ from odomap.geometry.camera import Camera
 from odomap.limits import Count, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.closure import Closure, carry_covariance, read_essentials
+from odomap.system.closure import Closure, Reading, carry_covariance, read_essentials
 from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Essentials, LoopEdges, correct
 from odomap.system.loopsides import LoopSide, read_side
@@ -65,7 +65,7 @@ class ClosingConfig:
 
     enabled: bool = False
     """Whether places seen before are recognised and the path is corrected there."""
-    recent: Count = 20
+    recent: Count = 10
     """Newest keyframes that are no places seen before."""
     rest: Count = 10
     """Keyframes after a loop was closed in which no other is."""
@@ -180,11 +180,10 @@ class LoopCloser:
         gone, come, stale = self._follow()
         self._since_closed += 1
         asked, self._asked = self._asked, []
-        read = [self._read(revisit) for revisit in asked]
-        candidates = [c for c in read if c is not None]
-        essentials = read_essentials(self._map, self._known) if candidates else None
+        candidates = self._read(asked)
+        path = read_essentials(self._map, self._known) if candidates else None
         recent = self._map.keyframe_ids[-self.config.recent :]
-        return ClosingJob(self, keyframe, gone, come, recent, stale, tuple(candidates), essentials)
+        return ClosingJob(self, keyframe, gone, come, recent, stale, candidates, path)
 
     def _follow(self) -> tuple[list[int], list[Keyframe], list[Acquaintance]]:
         """Write down which keyframes went and came, and return them.
@@ -204,14 +203,15 @@ class LoopCloser:
             stale += [] if were is None else [keyframe]
         return gone, [self._map.keyframe(k) for k in come], stale
 
-    def _read(self, revisit: Revisit) -> _Candidate | None:
-        """Read both sides of a candidate, or of what is left of its group."""
-        alive = self._map.is_keyframe_alive
-        there = [k for k in revisit.group.tolist() if alive(k)]
-        if not there or not alive(revisit.keyframe_id):
-            return None
-        read = self.verifier.read
-        return _Candidate(read(self._map, revisit.keyframe_id), read(self._map, there[0]))
+    def _read(self, revisits: list[Revisit]) -> tuple[_Candidate, ...]:
+        """Read both sides of the candidates of a keyframe, or of what is left of their groups."""
+        alive, read = self._map.is_keyframe_alive, self.verifier.read
+        there = [[k for k in revisit.group.tolist() if alive(k)] for revisit in revisits]
+        left = [group[0] for group in there if group]
+        if not left or not alive(revisits[0].keyframe_id):
+            return ()
+        newer = read(self._map, revisits[0].keyframe_id)
+        return tuple(_Candidate(newer, read(self._map, k)) for k in left)
 
     # ---- without the map ----
 
@@ -298,7 +298,7 @@ class ClosingJob:
         recent: (n,) newest keyframes.
         stale: keyframes that are surer than their mapper knew.
         candidates: of the keyframe before.
-        essentials: of the path; None without candidates.
+        path: what it is corrected with; None without candidates.
     """
 
     closer: LoopCloser
@@ -308,16 +308,16 @@ class ClosingJob:
     recent: Index
     stale: list[Acquaintance]
     candidates: tuple[_Candidate, ...]
-    essentials: Essentials | None
+    path: Reading | None
 
     def solve(self) -> "ClosingChange":
         """Look for places like this one, and decide on those found at the keyframe before."""
         closer = self.closer
         closer.index(self.gone, self.come)
         closer.recognise(self.keyframe, self.recent)
-        if self.essentials is None:
+        if self.path is None:
             return ClosingChange(closer, self.stale, (), None)
-        loops, closure = closer.close(self.candidates, self.essentials)
+        loops, closure = closer.close(self.candidates, self.path.essentials())
         _log(loops)
         return ClosingChange(closer, self.stale, tuple(loops), closure)
 

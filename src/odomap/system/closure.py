@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.maps.map import Map
-from odomap.maps.snapshot import Update
+from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import compose, inverse
 from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
 
-__all__ = ["LOOP", "Closure", "carry_covariance", "read_essentials"]
+__all__ = ["LOOP", "Closure", "Reading", "carry_covariance", "read_essentials"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -38,8 +38,45 @@ LOOP = "loop"
 """Kind of the edges in the map that loops leave."""
 
 
-def read_essentials(map: Map, known: Covisibility) -> Essentials:
-    """Read what an essential graph is made of.
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What is copied of the map and of what was written down, to be put together later.
+
+    Attributes:
+        snapshot: of all keyframes.
+        covariances: (K, 6, 6).
+        loops: closed before, by keyframe ids.
+        parent, growth, pairs: of `Covisibility`, of all keyframes there ever were.
+    """
+
+    snapshot: Snapshot
+    covariances: Array
+    loops: LoopEdges
+    parent: Index
+    growth: Array
+    pairs: Index
+
+    def essentials(self) -> Essentials:
+        """Return what an essential graph is made of."""
+        ids = self.snapshot.keyframe_ids
+        row = np.full(len(self.parent) + 1, -1)
+        row[ids] = np.arange(len(ids))
+        pairs = row[self.pairs]
+        return Essentials(
+            ids,
+            self.snapshot.Ts_world_body,
+            self.snapshot.scales,
+            self.covariances,
+            row[self.parent[ids]],
+            self.growth[ids],
+            pairs[(pairs >= 0).all(axis=1)],
+            self.loops._replace(i=row[self.loops.i], j=row[self.loops.j]),
+            self.snapshot.version,
+        )
+
+
+def read_essentials(map: Map, known: Covisibility) -> Reading:
+    """Read what a path is corrected with: copies only.
 
     Args:
         map: the map.
@@ -47,29 +84,14 @@ def read_essentials(map: Map, known: Covisibility) -> Essentials:
     """
     with map.lock:
         snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
-        ids = snapshot.keyframe_ids
-        covariances = map.states.covariances[ids]
-        loops = _read_loops(map, ids)
-    parent = known.parent[ids]
-    row = np.searchsorted(ids, parent)
-    row[parent < 0] = -1
-    pairs = known.pairs()
-    pairs = pairs[np.isin(pairs, ids).all(axis=1)]
-    return Essentials(
-        ids,
-        snapshot.Ts_world_body,
-        snapshot.scales,
-        covariances,
-        row,
-        known.growth[ids],
-        np.searchsorted(ids, pairs),
-        loops,
-        snapshot.version,
-    )
+        covariances = map.states.covariances[snapshot.keyframe_ids]
+        loops = _read_loops(map)
+    growth = known.growth.copy()
+    return Reading(snapshot, covariances, loops, known.parent.copy(), growth, known.pairs())
 
 
-def _read_loops(map: Map, alive: Index) -> LoopEdges:
-    """Return the loops closed before, between living keyframes, by rows of these."""
+def _read_loops(map: Map) -> LoopEdges:
+    """Return the loops closed before, between living keyframes, by ids of these."""
     edges = map.edges()
     chosen = np.flatnonzero(np.array(edges.kind, str) == LOOP)
     ends = edges.i[chosen], edges.j[chosen]
@@ -79,8 +101,7 @@ def _read_loops(map: Map, alive: Index) -> LoopEdges:
     Ad = se3_adjoint(D[0])
     information = np.swapaxes(Ad, 1, 2) @ edges.information[chosen] @ Ad
     is_one = p == q  # both ends have come to hang from one keyframe: nothing is left to say
-    kept = [x[~is_one] for x in (p, q, Ts, scales, information)]
-    return LoopEdges(*(np.searchsorted(alive, ids) for ids in kept[:2]), *kept[2:])
+    return LoopEdges(*(x[~is_one] for x in (p, q, Ts, scales, information)))
 
 
 def _held(map: Map, ids: Index) -> tuple[Index, tuple[Array, Array]]:
@@ -145,9 +166,12 @@ class Closure:
         before, after = self.before, self.after
         now = map.snapshot(before.keyframe_ids, landmarks=False)
         row = np.searchsorted(before.keyframe_ids, now.keyframe_ids)
-        read = before.Ts_world_body[row], before.scales[row]
-        moved = compose((after.Ts_world_body[row], after.scales[row]), inverse(read))
-        Ts, scales = compose(moved, (now.Ts_world_body, now.scales))
+        Ts, scales = after.Ts_world_body[row], after.scales[row]
+        is_as_read = (now.Ts_world_body == before.Ts_world_body[row]).all(axis=(1, 2))
+        other = np.flatnonzero(~(is_as_read & (now.scales == before.scales[row])))
+        read = before.Ts_world_body[row[other]], before.scales[row[other]]
+        moved = compose((Ts[other], scales[other]), inverse(read))
+        Ts[other], scales[other] = compose(moved, (now.Ts_world_body[other], now.scales[other]))
         root = int(before.keyframe_ids[before.root])
         return Update(
             anchor_id=root,

@@ -251,11 +251,24 @@ def _step_information(parts: Essentials, steps: Array, child: Index, with_scale:
     untold = np.diag(np.repeat([(STEP_LENGTH * length) ** 2, STEP_ANGLE**2], 3))
     growth = parts.growth[child].copy()
     growth[~np.isfinite(growth).all(axis=(1, 2))] = untold
-    values, axes = np.linalg.eigh(0.5 * (growth + np.swapaxes(growth, 1, 2)))
-    kept = (axes * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2)
-    information = np.linalg.inv(kept + FLOOR**2 * untold)
+    kept = _positive(growth, np.sqrt(np.diag(untold)))
+    information = np.asarray(np.linalg.inv(kept + FLOOR**2 * untold), np.float64)
     information = 0.5 * (information + np.swapaxes(information, 1, 2))
     return _with_log_scale(information, STEP_SCALE**-2, with_scale)
+
+
+def _positive(growth: Array, unit: Array) -> Array:
+    """Return the nearest positive semidefinite (n, 6, 6) with the same trace in some units (6,).
+
+    Errors that go on as they were, of the calibration, make a covariance grow by g δᵀ + δ gᵀ, which
+    is indefinite; a walk at random that is as unsure in the end grows by its trace.
+    """
+    scaled = 0.5 * (growth + np.swapaxes(growth, 1, 2)) / (unit[:, None] * unit)
+    values, axes = np.linalg.eigh(scaled)
+    positive = np.maximum(values, 0.0)
+    share = np.maximum(values.sum(axis=1), 0.0) / np.maximum(positive.sum(axis=1), 1e-300)
+    kept = (axes * (share[:, None] * positive)[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    return np.asarray(kept * (unit[:, None] * unit))
 
 
 def _with_log_scale(information: Array, of_scale: float, with_scale: bool) -> Array:
