@@ -72,7 +72,7 @@ class VerifyConfig:
     """Probability of a clean sample at which the search stops."""
     gate: Positive = 9.21
     """Squared error of an inlier in variances, 99 % of two degrees of freedom stay below."""
-    shared_px: NotNegative = 0.15
+    shared_px: NotNegative = 0.1
     """What errors that all points share are worth, pixels: the calibration, the poses that made
     the landmarks; they do not average out."""
     huber: Positive = 2.5
