@@ -2,16 +2,16 @@
 
     python benchmarks/kidnapped.py --data DATA [--recordings rgbd_desk euroc_mh01] [--no-words]
 
-A recording is played there and back (even frames forth, odd frames back), so that the way back
-shows nothing but mapped places. On the way back
+A recording is played from end to end. Then the camera is at another part of it all at once, and
+goes on from there for a second; then at another, and so on. Before it is there,
 
+    jump       nothing happens
     blank      the lens is covered for 2 s
-    jump       the camera is at a quarter of the way at once, and goes on forwards from there
-    elsewhere  for 2 s it sees what is nowhere in the map (the images mirrored), then it is back
+    elsewhere  for 2 s it sees what is nowhere in the map (the images mirrored)
 
-in each case from several instants on. Counted is the time from the first frame that shows a mapped
-place again to the first one that is placed there; and how far all frames from then on are off
-those of the same images in the undisturbed run, as they were emitted. Nothing is aligned.
+Counted is the time from the first frame that shows a mapped place again to the first one that is
+placed there, and how far the frames from then on are off the same ones in the path of the
+undisturbed run, as they are emitted. Nothing is aligned.
 
 Recognition alone: the map of the even frames is filled up with strange keyframes; the odd frames
 are looked up in it, and those of another recording, which are nowhere. Times are of the processor,
@@ -38,13 +38,14 @@ from numpy.typing import NDArray
 
 from odomap.evaluation.match import rotation_angle
 from odomap.files.vocabulary import Vocabulary
+from odomap.geometry.trajectory import Trajectory
 from odomap.maps.estimate import Estimate, Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
-from odomap.sources.disturb import blank, there_and_back
 from odomap.sources.open import open as open_source
-from odomap.sources.source import Source
+from odomap.sources.source import RandomAccess, Source
+from odomap.sources.wrappers import seekable
 from odomap.system.config import Config, preset, preset_for
 from odomap.system.placeindex import PlaceIndex
 from odomap.system.recognition import Recognizer
@@ -57,8 +58,9 @@ from odomap.vision.vocabulary import VocabularyTree
 UNSEEN_S = 2.0
 LONGEST_S, LARGEST_M, LARGEST_DEG = 1.0, 0.03, 1.0
 LONGEST_LOOK_MS, LONGEST_INDEX_S = 15.0, 0.7
-STARTS = (0.55, 0.65, 0.75)
-"""Where it happens, as parts of there and back."""
+PARTS = (0.5, 0.1, 0.7, 0.3)
+"""Where the camera is one time after the other, as parts of the recording."""
+KINDS = ("jump", "blank", "elsewhere")
 KEYFRAMES = 1000
 STRANGE, NOWHERE = ("kitti_stereo", "rgbd_desk", "euroc_mh01"), "kitti_mono"
 """Recordings that a map is filled up with, and one that is in none."""
@@ -71,8 +73,8 @@ class Outcome:
     Attributes:
         after_s: from the first frame that shows a mapped place to the first that is placed.
         found_m, found_deg: how far that one is off.
-        median_m, median_deg: of the frames of the second from then on.
-        worst_m, worst_deg: of all frames from then on.
+        median_m, median_deg: of the frames of the second.
+        worst_m, worst_deg: of the same.
     """
 
     after_s: float = np.inf
@@ -102,37 +104,42 @@ def played(system: Slam, frames: Iterator[Frame]) -> list[Estimate]:
     return [system.track(frame) for frame in frames]
 
 
-def kidnappings(source: Source, name: str) -> Iterator[tuple[list[Frame], int, NDArray[np.int64]]]:
-    """Yield disturbed versions of a source that was made by there_and_back.
+def kidnapped(
+    system: Slam, source: RandomAccess, kind: str, part: float, path: Trajectory, now_ns: int
+) -> tuple[Outcome, int]:
+    """Kidnap a camera to a part of its recording.
+
+    Args:
+        system: it has tracked all of it.
+        source: the recording.
+        kind: what happens first.
+        part: where the camera is then.
+        path: of the undisturbed run.
+        now_ns: stamp of the last frame.
 
     Returns:
-        The frames, which of them is the first in a mapped place again, and for each of them which
-        of the undisturbed source it shows; -1 for none.
+        What became of it, and the stamp of the last frame now.
     """
-    frames = list(source)
-    step_s = float(np.median(np.diff(source.stamps_ns))) * 1e-9
-    unseen = round(UNSEEN_S / step_s)
-    for part in STARTS:
-        start = round(part * len(frames))
-        shown = np.arange(len(frames))
-        if name == "jump":
-            # The way back from here on is left out up to a quarter, and played forwards.
-            quarter = len(frames) - len(frames) // 8
-            shown = np.concatenate([shown[:start], np.arange(quarter, start, -1)])
-            yield restamped([frames[k] for k in shown], source.stamps_ns), start, shown
-            continue
-        covered = range(start, min(start + unseen, len(frames)))
-        shown[covered.start : covered.stop] = -1
-        if name == "blank":
-            disturbed = list(blank(source, covered))
-        else:
-            disturbed = [mirrored(f) if f.id in covered else f for f in frames]
-        yield disturbed, covered.stop, shown
+    step_ns = int(np.median(np.diff(source.stamps_ns)))
+    unseen = 0 if kind == "jump" else round(UNSEEN_S * 1e9 / step_ns)
+    first = round(part * len(source))
+    before = [source.frame(len(source) - 1 - k % len(source)) for k in range(unseen)]
+    change = mirrored if kind == "elsewhere" else black
+    after = [source.frame(k) for k in range(first, min(first + 10**9 // step_ns, len(source)))]
+    shown = [frame.stamp_ns for frame in after]
+    frames = [
+        replace(frame, id=k, stamp_ns=now_ns + k * step_ns)
+        for k, frame in enumerate([*map(change, before), *after], start=1)
+    ]
+    estimates = played(system, iter(frames))[unseen:]
+    return outcome(estimates, shown, path), frames[-1].stamp_ns
 
 
-def restamped(frames: list[Frame], stamps_ns: NDArray[np.int64]) -> list[Frame]:
-    """Return frames in a new order at the times of the old one."""
-    return [replace(frame, id=k, stamp_ns=int(stamps_ns[k])) for k, frame in enumerate(frames)]
+def black(frame: Frame) -> Frame:
+    """Return a frame of a covered lens."""
+    images = [None if i is None else np.zeros_like(i) for i in frame.images]
+    depth = None if frame.depth is None else np.zeros_like(frame.depth)
+    return replace(frame, images=tuple(images), depth=depth)
 
 
 def mirrored(frame: Frame) -> Frame:
@@ -142,23 +149,24 @@ def mirrored(frame: Frame) -> Frame:
     return replace(frame, images=tuple(images[::-1]), depth=depth)
 
 
-def outcome(
-    estimates: list[Estimate], undisturbed: list[Estimate], back: int, shown: NDArray[np.int64]
-) -> Outcome:
-    """Compare a disturbed run with the undisturbed one, from the frame that is back on."""
-    placed = [k for k in range(back, len(estimates)) if estimates[k].status is not Status.LOST]
+def outcome(estimates: list[Estimate], shown: list[int], path: Trajectory) -> Outcome:
+    """Compare estimates with the path of an undisturbed run at the instants that they show."""
+    known = np.searchsorted(path.stamps_ns, shown)
+    placed = [
+        k
+        for k, e in enumerate(estimates)
+        if e.status in (Status.TRACKING, Status.RECOVERED) and path.stamps_ns[known[k]] == shown[k]
+    ]
     if not placed:
         return Outcome()
     Ts = np.array([estimates[k].T_world_body.matrix for k in placed])
-    truth = np.array([undisturbed[shown[k]].T_world_body.matrix for k in placed])
+    truth = path.Ts_world_body[known[placed]]
     metres = np.linalg.norm(Ts[:, :3, 3] - truth[:, :3, 3], axis=1)
     degrees = np.degrees(rotation_angle(np.swapaxes(truth[:, :3, :3], 1, 2) @ Ts[:, :3, :3]))
-    stamps = np.array([estimates[k].stamp_ns for k in placed])
-    soon = stamps - stamps[0] <= 1e9
     return Outcome(
-        (int(stamps[0]) - estimates[back].stamp_ns) * 1e-9,
+        (estimates[placed[0]].stamp_ns - estimates[0].stamp_ns) * 1e-9,
         *(float(metres[0]), float(degrees[0])),
-        *(float(np.median(metres[soon])), float(np.median(degrees[soon]))),
+        *(float(np.median(metres)), float(np.median(degrees))),
         *(float(metres.max()), float(degrees.max())),
     )
 
@@ -292,15 +300,16 @@ def lost_and_found(
     folder: Path, name: str, words: VocabularyTree | None
 ) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
     """Measure and print everything about a recording."""
-    source = there_and_back(open_source(folder / name))
+    source = seekable(open_source(folder / name))
     config = preset(preset_for(source.rig))
-    undisturbed = played(slam(source, config, words), iter(source))
-    print(f"{name:<20}{'after':>8}{'found at':>18}{'next second':>18}{'worst':>18}")
+    print(f"{name:<20}{'after':>8}{'found at':>18}{'median':>18}{'worst':>18}")
     found = {}
-    for kind in ("blank", "jump", "elsewhere"):
-        for part, (frames, back, shown) in zip(STARTS, kidnappings(source, kind), strict=True):
-            estimates = played(slam(source, config, words), iter(frames))
-            o = outcome(estimates, undisturbed, back, shown)
+    for kind in KINDS:
+        system, now_ns = slam(source, config, words), int(source.stamps_ns[-1])
+        played(system, iter(source))
+        path = system.finish().trajectory
+        for part in PARTS:
+            o, now_ns = kidnapped(system, source, kind, part, path, now_ns)
             found[f"{kind} {part}"] = asdict(o)
             pairs = (o.found_m, o.found_deg), (o.median_m, o.median_deg), (o.worst_m, o.worst_deg)
             said = "".join(f"{m:>10.4f} m{deg:>5.2f}°" for m, deg in pairs)
