@@ -9,7 +9,8 @@ from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.closing import ClosingConfig, LoopCloser, SideVerifier
+from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.vision.matching import MatchConfig
 from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
 
@@ -27,7 +28,8 @@ def verifier(with_scale=False):
 
 def closer_of(circuit, vocabulary, with_scale=False, check=None, config=ENABLED, **how):
     check = verifier(with_scale) if check is None else check
-    return LoopCloser(circuit.map, vocabulary, check, with_scale, config, **how)
+    search = LoopSearch(vocabulary, config)
+    return LoopCloser(circuit.map, search, check, with_scale, config, **how)
 
 
 def go(circuit, closer, keyframes=None):
@@ -236,7 +238,7 @@ def test_the_same_bytes_come_out_every_time(vocabulary):
 
 def test_an_empty_map_and_keyframes_without_features_do_no_harm(vocabulary):
     m = Map()
-    closer = LoopCloser(m, vocabulary, verifier(), False, ENABLED)
+    closer = LoopCloser(m, LoopSearch(vocabulary, ENABLED), verifier(), False, ENABLED)
     for n in range(3):
         m.add_keyframe(Keyframe(n, n), np.eye(4))
         change = closer.add(m.keyframe(n)).solve()

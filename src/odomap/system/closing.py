@@ -7,10 +7,8 @@ goes from keyframe to keyframe, in two steps:
     keyframe k + 1  both sides are read (`loopsides`) → geometry decides (`verifying`)
                     → the path, corrected by an essential graph (`essentialgraph`)
 
-What the first step asks of the map, who shares landmarks with whom, is written down when keyframes
-come (`covisibility`). What is tied by landmarks needs no loop: keyframes that share some with the
-new one, those that share some with these, and the newest are not looked for; nor is anything for
-some keyframes after a loop was closed. Each candidate that is refused says why.
+What the first step asks of the map is written down when keyframes come (`loopsearch`). For some
+keyframes after a loop was closed nothing is looked for. Each candidate that is refused says why.
 
 What is written is how keyframes move, S ← S_corrected S_read⁻¹ S_now, so that what mapping found in
 the meantime stays; then landmarks that turned out to be one are fused, and the measurement is kept
@@ -32,23 +30,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
-from odomap.limits import Count, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import Closure, Reading, carry_covariance, read_essentials
-from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
+from odomap.system.covisibility import Acquaintance
 from odomap.system.essentialgraph import Essentials, LoopEdges, correct
+from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
 from odomap.system.loopsides import LoopSide, read_side
-from odomap.system.revisits import Revisit, RevisitConfig, Revisits
+from odomap.system.revisits import Revisit
 from odomap.system.stages import Loop
 from odomap.system.verifying import Verified, VerifyConfig, verify
 from odomap.vision.matching import MatchConfig
-from odomap.vision.places import Places
-from odomap.vision.vocabulary import VocabularyTree
 
 __all__ = [
     "ClosingChange",
-    "ClosingConfig",
     "ClosingJob",
     "LoopCloser",
     "SideVerifier",
@@ -57,27 +52,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class ClosingConfig:
-    """When loops are looked for, and closed."""
-
-    enabled: bool = False
-    """Whether places seen before are recognised and the path is corrected there."""
-    recent: Count = 10
-    """Newest keyframes that are no places seen before."""
-    rest: Count = 10
-    """Keyframes after a loop was closed in which no other is."""
-    most: Count = 2
-    """Places that geometry is asked about at a keyframe."""
-    min_shared: Count = 15
-    """Landmarks that two keyframes must share to be tied by them: no loop is needed."""
-    strong_shared: Count = 100
-    """Landmarks that they must share to hold each other in place when the path is corrected."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class Verifier(Protocol):
@@ -146,62 +120,36 @@ class LoopCloser:
 
     Args:
         map: where keyframes and landmarks are; what it holds already is taken in at once.
-        vocabulary: makes the words.
-        verifier: asked about candidates.
+        search: finds candidates.
+        verifier: asked about them.
         with_scale: whether scale drifts: a single camera.
         config: when loops are looked for.
-        revisits: when a place is worth a closer look.
         on_closed: called when the map's covariances have been corrected, before anybody reads them.
     """
 
     def __init__(
         self,
         map: Map,
-        vocabulary: VocabularyTree,
+        search: LoopSearch,
         verifier: Verifier,
         with_scale: bool,
-        config: ClosingConfig | None = None,
-        revisits: RevisitConfig | None = None,
+        config: ClosingConfig,
         on_closed: Callable[[], None] | None = None,
     ) -> None:
-        self.config = ClosingConfig() if config is None else config
-        self.verifier, self.with_scale, self.vocabulary = verifier, with_scale, vocabulary
-        self._map, self._on_closed = map, on_closed
-        self._known = Covisibility(self.config.min_shared, self.config.strong_shared)
-        self._places = Places(vocabulary.num_words)
-        self._revisits = Revisits(self._places, revisits)
+        self._map, self.search, self.verifier = map, search, verifier
+        self._with_scale, self._config, self._on_closed = with_scale, config, on_closed
         self._asked: list[Revisit] = []
-        self._since_closed: int = self.config.rest
-        self._were: dict[int, Array] = {}
-        self.index(*self._follow()[:2])
+        self._since_closed: int = config.rest
+        search.index(search.follow(map))
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":
         """Take in a keyframe that is in the map, and read both sides of the last candidates."""
-        gone, come, stale = self._follow()
+        news = self.search.follow(self._map)
         self._since_closed += 1
         asked, self._asked = self._asked, []
         candidates = self._read(asked)
-        path = read_essentials(self._map, self._known) if candidates else None
-        recent = self._map.keyframe_ids[-self.config.recent :]
-        return ClosingJob(self, keyframe, gone, come, recent, stale, candidates, path)
-
-    def _follow(self) -> tuple[list[int], list[Keyframe], list[Acquaintance]]:
-        """Write down which keyframes went and came, and return them.
-
-        The third are those whose covariance a mapper found that did not know of a loop yet.
-        """
-        alive = self._map.keyframe_ids
-        known = self._known.keyframe_ids
-        gone = known[~np.isin(known, alive)].tolist()
-        come = alive[~np.isin(alive, known)].tolist()
-        for k in gone:
-            self._known.cull(k)
-        stale = []
-        for k in come:
-            were = self._were.pop(k, None)
-            self._known.add(keyframe := acquaint(self._map, k, were))
-            stale += [] if were is None else [keyframe]
-        return gone, [self._map.keyframe(k) for k in come], stale
+        path = read_essentials(self._map, self.search.known) if candidates else None
+        return ClosingJob(self, keyframe, news, candidates, path)
 
     def _read(self, revisits: list[Revisit]) -> tuple[_Candidate, ...]:
         """Read both sides of the candidates of a keyframe, or of what is left of their groups."""
@@ -215,25 +163,12 @@ class LoopCloser:
 
     # ---- without the map ----
 
-    def index(self, gone: list[int], come: list[Keyframe]) -> None:
-        """Keep the database of places up to date."""
-        for k in gone:
-            self._places.remove(k)
-        for keyframe in come:
-            descriptors = _descriptors(keyframe)
-            if descriptors is not None:
-                self._places.add(keyframe.id, self.vocabulary.transform(descriptors))
-
-    def recognise(self, keyframe: Keyframe, recent: Index) -> None:
+    def recognise(self, keyframe: Keyframe, news: News) -> None:
         """Look for places like a keyframe's; what is found is read when the next one comes."""
-        descriptors = _descriptors(keyframe)
-        if descriptors is None:
-            return
-        bow = self.vocabulary.transform(descriptors)
-        excluded = [*self._known.around(keyframe.id), *recent.tolist()]
-        found = self._revisits.find(keyframe.id, bow, excluded, self._known.neighbours)
-        if self._since_closed >= self.config.rest:
-            self._asked = [r for r in found if r.is_candidate][: self.config.most]
+        self.search.index(news)
+        found = self.search.find(keyframe, news.recent)
+        if self._since_closed >= self._config.rest:
+            self._asked = found[: self._config.most]
 
     def close(
         self, candidates: tuple[_Candidate, ...], essentials: Essentials
@@ -254,7 +189,7 @@ class LoopCloser:
                     np.array([found.scale]),
                     found.information[None],
                 )
-                corrected = correct(essentials, edge, self.with_scale)
+                corrected = correct(essentials, edge, self._with_scale)
                 if corrected.is_accepted:
                     loops.append(replace(loop, is_accepted=True))
                     return loops, Closure(*ends, found, essentials, corrected)
@@ -263,14 +198,13 @@ class LoopCloser:
         return loops, None
 
     def _with_nodes(self, side: LoopSide) -> LoopSide:
-        return side.with_nodes(self.vocabulary.transform(side.descriptors).nodes)
+        return side.with_nodes(self.search.nodes(side.descriptors))
 
     # ---- with the map again ----
 
     def write(self, closure: Closure, map: Map) -> None:
         """Correct the map by a loop, and begin to look anew."""
-        self._were.update(closure.write(map, self._known))
-        self._revisits.forget()
+        self.search.begin_anew(closure.write(map, self.search.known))
         self._asked, self._since_closed = [], 0
         self._tell_closed()
 
@@ -293,33 +227,27 @@ class ClosingJob:
     Attributes:
         closer: whose job it is; its database of places belongs to the one job that is out.
         keyframe: the new keyframe.
-        gone: keyframes that were culled.
-        come: keyframes that are new, this one among them.
-        recent: (n,) newest keyframes.
-        stale: keyframes that are surer than their mapper knew.
+        news: what became of the map's keyframes.
         candidates: of the keyframe before.
         path: what it is corrected with; None without candidates.
     """
 
     closer: LoopCloser
     keyframe: Keyframe
-    gone: list[int]
-    come: list[Keyframe]
-    recent: Index
-    stale: list[Acquaintance]
+    news: News
     candidates: tuple[_Candidate, ...]
     path: Reading | None
 
     def solve(self) -> "ClosingChange":
         """Look for places like this one, and decide on those found at the keyframe before."""
         closer = self.closer
-        closer.index(self.gone, self.come)
-        closer.recognise(self.keyframe, self.recent)
+        stale = self.news.stale
+        closer.recognise(self.keyframe, self.news)
         if self.path is None:
-            return ClosingChange(closer, self.stale, (), None)
+            return ClosingChange(closer, stale, (), None)
         loops, closure = closer.close(self.candidates, self.path.essentials())
         _log(loops)
-        return ClosingChange(closer, self.stale, tuple(loops), closure)
+        return ClosingChange(closer, stale, tuple(loops), closure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,14 +271,6 @@ class ClosingChange:
         self.closer.refresh(self.stale, map)
         if self.closure is not None:
             self.closer.write(self.closure, map)
-
-
-def _descriptors(keyframe: Keyframe) -> NDArray[np.uint8] | None:
-    """Return the (N, 32) descriptors of a keyframe; None where it has none of 256 bits."""
-    features = keyframe.features
-    if features is None or features.descriptors.shape[1:] != (32,) or not len(features):
-        return None
-    return features.descriptors
 
 
 def _log(loops: list[Loop]) -> None:

@@ -22,12 +22,12 @@ from odomap.system.association import (
 )
 from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
-from odomap.system.closing import ClosingConfig
 from odomap.system.creating import CreateConfig
 from odomap.system.culling import CullConfig
 from odomap.system.fusing import FuseConfig
 from odomap.system.localmap import LocalMapConfig
 from odomap.system.localmapping import MappingConfig
+from odomap.system.loopsearch import ClosingConfig
 from odomap.system.mapping import WindowConfig
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.bootstrap import BootstrapConfig

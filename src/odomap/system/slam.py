@@ -22,16 +22,16 @@ from odomap.errors import ConfigError
 from odomap.files.vocabulary import Vocabulary
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
-from odomap.system.closing import LoopCloser, SideVerifier
 from odomap.system.config import Config, make_association, preset, preset_for
 from odomap.system.keyframetracking import KeyframeTracker
 from odomap.system.keyframing import Keyframes
 from odomap.system.localmapping import LocalMapper, MappingSections
+from odomap.system.loopsearch import LoopSearch
 from odomap.system.maptracking import MapTracker
 from odomap.system.path import Path
 from odomap.system.recognisedstart import RecognisedStart
 from odomap.system.recognition import Recognizer
-from odomap.system.stages import Stages
+from odomap.system.stages import Closer, Stages
 from odomap.system.starting import make_start
 from odomap.system.visual import Sight, VisualSystem
 from odomap.vision.vocabulary import VocabularyTree
@@ -111,7 +111,9 @@ class Slam(VisualSystem):
         closer = self._closer(sight, sections, config) if config.closing.enabled else None
         return Stages(self.map, self._tracker, self._mapper, closer)
 
-    def _closer(self, sight: Sight, sections: MappingSections, config: Config) -> LoopCloser:
+    def _closer(self, sight: Sight, sections: MappingSections, config: Config) -> Closer:
+        from odomap.system.closing import LoopCloser, SideVerifier  # what compiles pose graphs
+
         eye, with_scale = sight.eye, sight.ranger is None
         verifier = SideVerifier(
             eye.camera,
@@ -122,8 +124,8 @@ class Slam(VisualSystem):
             sections.matching,
         )
         words = Vocabulary.load() if self._vocabulary is None else self._vocabulary
-        forget = self._mapper.forget_drifts
-        return LoopCloser(self.map, words, verifier, with_scale, config.closing, on_closed=forget)
+        search, forget = LoopSearch(words, config.closing), self._mapper.forget_drifts
+        return LoopCloser(self.map, search, verifier, with_scale, config.closing, forget)
 
     @property
     def _path(self) -> Path:

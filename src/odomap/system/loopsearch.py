@@ -1,0 +1,159 @@
+"""Looking for loops: which places seen before a new keyframe may show, keyframe by keyframe.
+
+The search follows a map whose keyframes come and go, and reads it only for that: who shares
+landmarks with whom is written down (`covisibility`), so that words can be looked up, and the places
+found grouped, in a thread that must not touch the map.
+
+What landmarks tie already needs no loop. Left out are the newest keyframes, those that share
+landmarks with the new one, and those that share some with these:
+
+    excluded = newest ∪ N(k) ∪ N(N(k)).
+
+Everything else is up to words (`vision/places`) and to how long they last (`revisits`).
+
+Cost: O(keyframes that are new) to follow, and a query of some milliseconds.
+
+Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
+T-RO 2015, section VII-A.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.limits import Count, check_limits
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
+from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
+from odomap.system.revisits import Revisit, RevisitConfig, Revisits
+from odomap.vision.places import Places
+from odomap.vision.vocabulary import VocabularyTree
+
+__all__ = ["ClosingConfig", "LoopSearch", "News"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ClosingConfig:
+    """When loops are looked for, and closed."""
+
+    enabled: bool = False
+    """Whether places seen before are recognised and the path is corrected there."""
+    recent: Count = 10
+    """Newest keyframes that are no places seen before."""
+    rest: Count = 10
+    """Keyframes after a loop was closed in which no other is."""
+    most: Count = 2
+    """Places that geometry is asked about at a keyframe."""
+    min_shared: Count = 15
+    """Landmarks that two keyframes must share to be tied by them: no loop is needed."""
+    strong_shared: Count = 100
+    """Landmarks that they must share to hold each other in place when the path is corrected."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+class News(NamedTuple):
+    """What became of a map's keyframes.
+
+    Attributes:
+        gone: keyframes that were culled.
+        come: keyframes that are new.
+        stale: those of them whose covariance a mapper found that did not know of a loop yet.
+        recent: (n,) the newest keyframes.
+    """
+
+    gone: list[int]
+    come: list[Keyframe]
+    stale: list[Acquaintance]
+    recent: Index
+
+
+class LoopSearch:
+    """Looks for places like those that keyframes show.
+
+    Args:
+        vocabulary: makes the words.
+        config: which keyframes are left out.
+        revisits: when a place is worth a closer look.
+
+    Attributes:
+        known: what was written down of the map's keyframes.
+    """
+
+    def __init__(
+        self,
+        vocabulary: VocabularyTree,
+        config: ClosingConfig,
+        revisits: RevisitConfig | None = None,
+    ) -> None:
+        self._vocabulary, self._config = vocabulary, config
+        self.known = Covisibility(config.min_shared, config.strong_shared)
+        self._places = Places(vocabulary.num_words)
+        self._revisits = Revisits(self._places, revisits)
+        self._were: dict[int, Array] = {}
+
+    def follow(self, map: Map) -> News:
+        """Write down which keyframes of a map went and came."""
+        alive, known = map.keyframe_ids, self.known.keyframe_ids
+        gone = known[~np.isin(known, alive)].tolist()
+        come = alive[~np.isin(alive, known)].tolist()
+        for k in gone:
+            self.known.cull(k)
+        stale = []
+        for k in come:
+            were = self._were.pop(k, None)
+            self.known.add(keyframe := acquaint(map, k, were))
+            stale += [] if were is None else [keyframe]
+        recent = alive[-self._config.recent :]
+        return News(gone, [map.keyframe(k) for k in come], stale, recent)
+
+    def index(self, news: News) -> None:
+        """Keep the words of all keyframes up to date."""
+        for k in news.gone:
+            self._places.remove(k)
+        for keyframe in news.come:
+            descriptors = _descriptors(keyframe)
+            if descriptors is not None:
+                self._places.add(keyframe.id, self._vocabulary.transform(descriptors))
+
+    def find(self, keyframe: Keyframe, recent: Index) -> list[Revisit]:
+        """Find places that are worth a closer look, the most alike first.
+
+        Args:
+            keyframe: the new one.
+            recent: (n,) keyframes that are none.
+        """
+        descriptors = _descriptors(keyframe)
+        if descriptors is None:
+            return []
+        bow = self._vocabulary.transform(descriptors)
+        excluded = [*self.known.around(keyframe.id), *recent.tolist()]
+        found = self._revisits.find(keyframe.id, bow, excluded, self.known.neighbours)
+        return [revisit for revisit in found if revisit.is_candidate]
+
+    def nodes(self, descriptors: NDArray[np.uint8]) -> Index:
+        """Return the (N,) nodes of (N, 32) descriptors in the direct index."""
+        return self._vocabulary.transform(descriptors).nodes
+
+    def begin_anew(self, were: dict[int, Array]) -> None:
+        """Forget what places were pointed at: a loop was closed.
+
+        Args:
+            were: how sure the parents were of keyframes that came since it was found.
+        """
+        self._were.update(were)
+        self._revisits.forget()
+
+
+def _descriptors(keyframe: Keyframe) -> NDArray[np.uint8] | None:
+    """Return the (N, 32) descriptors of a keyframe; None where it has none of 256 bits."""
+    features = keyframe.features
+    if features is None or features.descriptors.shape[1:] != (32,) or not len(features):
+        return None
+    return features.descriptors
