@@ -10,7 +10,9 @@ from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.config import preset
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
+from odomap.system.slam import Slam
 from odomap.vision.matching import MatchConfig
 from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
 
@@ -244,3 +246,20 @@ def test_an_empty_map_and_keyframes_without_features_do_no_harm(vocabulary):
         change = closer.add(m.keyframe(n)).solve()
         assert change.loops == ()
         change.write(m)
+
+
+@pytest.mark.parametrize("rhythm", ["inline", "lockstep", "live"])
+def test_slam_looks_for_loops_where_it_is_asked_to(room, vocabulary, rhythm):
+    config = replace(preset("stereo"), closing=ENABLED)
+    paths = []
+    for _ in range(1 if rhythm == "live" else 2):
+        slam, loops = Slam(room.rig, config, rhythm, vocabulary=vocabulary), []
+        slam.worker.on_loop.append(loops.append)
+        for frame in room.part(0, 24):
+            slam.track(frame)
+        paths.append(slam.finish().trajectory)
+        assert isinstance(slam.worker.stages.closer, LoopCloser)
+        assert len(slam.worker.stages.closer.search.known.keyframe_ids) > 1
+        assert not any(loop.is_accepted for loop in loops)
+    assert len({path.Ts_world_body.tobytes() for path in paths}) == 1
+    assert Slam(room.rig, preset("stereo")).worker.stages.closer is None
