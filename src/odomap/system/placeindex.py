@@ -32,7 +32,7 @@ Index = NDArray[np.int64]
 
 KEYFRAMES = 8
 """Keyframes that compete, the most alike."""
-GROUP = 5
+GROUP = 6
 """Keyframes of a place: one and those that share most landmarks with it."""
 GROUP_SHARE = 0.3
 """Summed score of a place relative to that of the best one."""

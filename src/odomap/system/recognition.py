@@ -42,7 +42,7 @@ CANDIDATES = 4
 """Keyframes that a pose is looked for with."""
 PLACES = 3
 """Places that a pose is looked for in, where words tell them."""
-NEIGHBOURS = 4
+NEIGHBOURS = 5
 """Keyframes that join a candidate: those that share most landmarks with it."""
 
 
