@@ -7,8 +7,8 @@
 Either is a run (`odomap.run`) that begins with a map: nothing is known of where the first frame
 was taken, so it is recognised among the map's places (`system.recognition`). Frames before that
 are lost. Words of places are no part of a map: they are made anew by the vocabulary at hand, so
-that a map made with another one needs nothing. The trajectory is that of the new recording alone, in the world of the map, and its
-stamps may be earlier than those of the map, or the same.
+that a map made with another one needs nothing. The trajectory is that of the new recording alone,
+in the world of the map, and its stamps may be earlier than those of the map, or the same.
 """
 
 import sys
