@@ -102,7 +102,11 @@ def test_a_hand_held_depth_camera(data_folder):
     source = open_source(data_folder / "rgbd_desk")
     assert preset_for(source.rig) == "rgbd"
     estimates, result = run(source, RgbdVO(source.rig))
-    assert {e.status for e in estimates} == {Status.TRACKING}
+    # A window that moves the last pose by a leap says so.
+    corrected = [e for e in estimates if e.status is Status.RECOVERED]
+    assert all("the map was corrected" in e.reason for e in corrected)
+    assert len(corrected) <= 3
+    assert {e.status for e in estimates} <= {Status.TRACKING, Status.RECOVERED}
     assert len(result.trajectory) == len(estimates) == 160
     assert result.is_metric
     found = ate(result.trajectory, source.truth)

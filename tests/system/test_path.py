@@ -49,6 +49,22 @@ def test_frames_follow_a_keyframe_that_is_corrected_but_live_ones_stay(map):
     np.testing.assert_allclose(path.last_pose(), now)
 
 
+@pytest.mark.parametrize(("moved", "is_leap"), [(0.002, False), (0.2, True)])
+def test_a_correction_that_makes_the_last_pose_leap_is_told(map, moved, is_leap):
+    """The body has moved a centimetre per frame so far, and is known to a millimetre."""
+    path = Path(map)
+    for n in range(4):
+        T = se3_exp(np.array([0.01 * n, 0, 0, 0, 0, 0]))
+        path.append(Placed(150 + n, 1, T, 1e-6 * np.eye(6)))
+    assert path.correction() == ""
+    snapshot = map.snapshot([1], [0])
+    Ts = snapshot.Ts_world_body.copy()
+    Ts[0] = Ts[0] @ se3_exp(np.array([0, moved, 0, 0, 0, 0]))
+    map.apply(snapshot.solved(Ts, snapshot.points_world))
+    said = path.correction()
+    assert said == (f"the map was corrected: the last pose moved by {moved:g}" if is_leap else "")
+
+
 def test_the_covariance_is_that_of_the_keyframe_carried_over_and_the_frames_own(map):
     path = Path(map)
     frame = Placed(150, 2, pose(7), covariance(7))

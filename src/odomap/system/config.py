@@ -98,9 +98,9 @@ def _stereo() -> Config:
 
 def _mono() -> Config:
     # A camera that moves forwards sees its landmarks grow and turn: more of their bits change, and
-    # few landmarks to spare has the one that makes them from parallax alone.
+    # few landmarks to spare has the one that makes them from parallax alone. So it has more.
     return Config(
-        orb=OrbConfig(levels=5),
+        orb=OrbConfig(count=1500, levels=5),
         matching=MatchConfig(max_hamming=80),
         tracking=TrackingConfig(sensors="mono"),
         bundle=BundleConfig(iterations=8),

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.geometry.camera import Camera
 from odomap.sensors.frame import Frame
-from odomap.system.association import Association, View
+from odomap.system.association import Association, TrackingConfig, View
 from odomap.system.eye import Eye
 from odomap.system.locating import Located
+from odomap.vision.coverage import coverage
 
-__all__ = ["Clock", "Look", "Looker", "Unseen", "why_lost"]
+__all__ = ["Clock", "Look", "Looker", "Unseen", "doubt"]
 
 BLANK = 8.0
 """Standard deviation of grey levels below which an image shows nothing."""
@@ -105,8 +107,17 @@ class Looker:
         return np.array_equal(before, self._raw) and float(before.std()) > BLANK
 
 
-def why_lost(located: Located, needed: int, view: View) -> str:
-    """Say in a sentence why too few observations agree."""
+def doubt(located: Located, config: TrackingConfig, view: View, camera: Camera) -> str:
+    """Say in a sentence why a pose is not to be believed; empty if it is."""
+    needed = config.min_inliers
+    if located.num_inliers >= needed:
+        covered = coverage(located.pixels[located.inliers], camera)
+        if covered >= config.min_coverage:
+            return ""
+        return (
+            f"what agrees covers {100 * covered:.1f} % of the image, "
+            f"{100 * config.min_coverage:g} % needed: something before the lens?"
+        )
     contrast = float(view.pyramid[-1].std())
     if contrast < BLANK:
         cause = (

@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SHARE = 0.3
-"""Part of the likely landmarks of a single camera that must agree before others are looked for."""
+"""Part of the likely landmarks that must agree before others are looked for."""
 FULLY = 0.9
 """A frame that shows this part of what its keyframe showed adds nothing, however late it comes."""
 STILL = 0.005
@@ -155,9 +155,9 @@ class MapTracker(Tracker[LocalMap]):
 
     def _try(self, view: View, known: LocalMap, T_world_body: Array, needed: int) -> Located:
         likely = known.rows_of(self._shown)
-        if self._is_single:  # of those that are likely as large a part is asked for as of all
-            share = max(self._tracking.min_inliers, int(SHARE * len(likely)))
-            needed = min(needed, share)
+        # Of those that are likely as large a part is asked for as of all.
+        share = max(self._tracking.min_inliers, int(SHARE * len(likely)))
+        needed = min(needed, share)
         return self._locator.locate(view, known, likely, T_world_body, needed)
 
     def _begin(self, look: Look) -> Estimate:

@@ -22,6 +22,11 @@ __all__ = ["Path", "Placed"]
 
 Array = NDArray[np.float64]
 
+LEAP = 3.0
+"""Times the fastest that a body has moved so far, from which on it leaps."""
+SIGMAS = 5.0
+"""Standard deviations of a frame's place relative to its keyframe that it must be as well."""
+
 
 @dataclass(frozen=True, eq=False)
 class Placed:
@@ -47,6 +52,8 @@ class Path:
         self._map = map
         self._frames: list[Placed] = []
         self._live: list[tuple[int, Array, Array]] = []
+        self._relative = np.zeros((6, 6))
+        self._fastest = np.zeros(2)
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -59,8 +66,11 @@ class Path:
     def append(self, frame: Placed) -> tuple[Array, Array]:
         """Add a frame; return its pose (4, 4) and covariance (6, 6) in the world as known now."""
         self._frames.append(frame)
+        self._relative = frame.covariance
         T_world_body, covariance = self._pose(frame), self.covariance(frame)
         self._live.append((frame.stamp_ns, T_world_body, covariance))
+        speed = np.linalg.norm(self.velocity().reshape(2, 3), axis=1)
+        self._fastest = np.maximum(self._fastest, speed)
         return T_world_body, covariance
 
     def replace_last(self, frame: Placed) -> None:
@@ -74,6 +84,28 @@ class Path:
     def last_pose(self) -> Array:
         """Return the last frame's T_world_body (4, 4) as known now; identity if there is none."""
         return self._pose(self._frames[-1]) if self._frames else np.eye(4)
+
+    def is_leap(self, T_expected: Array, T_found: Array, covariance: Array) -> bool:
+        """Say whether a pose (4, 4) lies further from where it was expected than a body can move.
+
+        Further, that is, than it would at `LEAP` times its highest speed so far, and than a pose
+        relative to its keyframe, whose covariance (6, 6) is given, is unsure by.
+        """
+        if len(self._frames) < 3:
+            return False
+        step = 1e-9 * (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * self._fastest
+        sigma = np.sqrt(np.diag(covariance).reshape(2, 3).max(axis=1))
+        apart = _lengths(T_expected, T_found)
+        return bool((apart > np.maximum(LEAP * step, SIGMAS * sigma)).any())
+
+    def correction(self) -> str:
+        """Say in a sentence if the map has been corrected so that the last pose leapt; else ""."""
+        if not self._live or self._live[-1][0] != self.last.stamp_ns:
+            return ""
+        then, now = self._live[-1][1], self._pose(self.last)
+        if not self.is_leap(then, now, self._relative):
+            return ""
+        return f"the map was corrected: the last pose moved by {_lengths(then, now)[0]:.2g}"
 
     def last_covariance(self) -> Array:
         """Return the last frame's covariance (6, 6) as known now; zero before there is one."""
@@ -115,6 +147,11 @@ class Path:
 
     def _pose(self, frame: Placed) -> Array:
         return self._map.place(frame.keyframe_id, frame.T_keyframe_body)
+
+
+def _lengths(T_from: Array, T_to: Array) -> Array:
+    """Return how far apart two poses are: a length, and an angle in radians."""
+    return np.asarray(np.linalg.norm(se3_log(se3_inverse(T_from) @ T_to).reshape(2, 3), axis=1))
 
 
 def _trajectory(rows: list[tuple[int, Array, Array]]) -> Trajectory:

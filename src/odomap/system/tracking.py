@@ -36,7 +36,7 @@ from odomap.system.dispute import FEWEST, SETTLED
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located
-from odomap.system.looking import Clock, Look, Looker, Unseen, why_lost
+from odomap.system.looking import Clock, Look, Looker, Unseen, doubt
 from odomap.system.path import Path, Placed
 from odomap.system.starting import Start, Started, Waiting
 from odomap.system.veil import VEILED, Veil
@@ -163,12 +163,12 @@ class Tracker(ABC, Generic[K]):
         known, located, status = self._locate(self._veil.lifted(look.view), known)
         located = self._of_one_piece(known, located)
         look.clock.lap("track")
-        if located.num_inliers >= self._tracking.min_inliers:
+        reason = doubt(located, self._tracking, look.view, self._eye.camera)
+        if not reason:
             return self._accept(look, known, located, status)
         is_patient = self._lost < self._tracking.patience or self._veil.is_shown
         if not is_patient and self._may_start_anew():
             return self._begin(look)
-        reason = why_lost(located, self._tracking.min_inliers, look.view)
         return self._lose(look.frame, reason, look.clock)
 
     def make_keyframe(self) -> Keyframe | None:
@@ -239,6 +239,8 @@ class Tracker(ABC, Generic[K]):
             located.inliers,
         )
         reason, is_keyframe = "", self._wants_keyframe(known, located)
+        if status is Status.TRACKING and (moved := self.path.correction()):
+            status, reason = Status.RECOVERED, moved
         if is_keyframe and (missing := self._missing(look.frame)):
             reason, is_keyframe = f"{missing}: no keyframe", False
         if is_keyframe and self._veil.hides(
@@ -313,7 +315,10 @@ class Tracker(ABC, Generic[K]):
             return *again, Status.RECOVERED
         if best.num_inliers >= self._tracking.min_inliers:
             best = self._try(view, known, best.T_world_body, 0)
-        return known, best, tracked
+        # Few agree: if that is somewhere else than expected, it is not as if all was well.
+        steady = T_last @ next(self._motions(view))
+        leaps = self.path.is_leap(steady, best.T_world_body, best.covariance)
+        return known, best, Status.RECOVERED if leaps else tracked
 
     def _convinces(self, again: tuple[K, Located], tracked: tuple[K, Located]) -> bool:
         """Say whether a pose found without a guess is to be believed rather than the tracked one.
