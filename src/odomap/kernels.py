@@ -24,6 +24,15 @@ _PACKAGE = Path(__file__).parent
 
 LATE = ("odomap.geometry.", "odomap.maps.views_kernels")
 """Modules that are often used without their kernels, which are imported at their first use."""
+RARE = (
+    "odomap.geometry.alignransac_kernels",
+    "odomap.geometry.horn_kernels",
+    "odomap.vision.inverted",
+    "odomap.vision.kmajority",
+    "odomap.vision.vocabulary",
+    "odomap.vision.wordmatching",
+)
+"""Modules that only serve where places are told by words, which is not the default."""
 F = TypeVar("F", bound=Callable[..., object])
 
 
@@ -76,7 +85,8 @@ def needed_modules() -> list[str]:
     Once a system is made, what it did not import it does not need.
     """
     imported = set(sys.modules)  # looking for kernels imports packages
-    return [n for n in modules_with_kernels() if n in imported or n.startswith(LATE)]
+    names = [n for n in modules_with_kernels() if n in imported or n.startswith(LATE)]
+    return [n for n in names if n not in RARE]
 
 
 def warm_up(name: str) -> float:
