@@ -26,6 +26,7 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.geometry.pnp import PnpResult, refine_pose, solve_pnp
 from odomap.maps.map import Map
+from odomap.vision.coverage import coverage
 from odomap.vision.matching import KeypointGrid, MatchConfig, match_projected, nearest
 from odomap.vision.wordmatching import match_words
 
@@ -151,7 +152,7 @@ class Resection:
         rows, ids = rows[result.inliers], ids[result.inliers]
         if len(rows) < self._min_inliers:
             return len(rows), self._too_few(len(rows))
-        share = _spread(view.keypoints[rows]) / (self._camera.width * self._camera.height)
+        share = coverage(view.keypoints[rows], self._camera)
         if not result.converged or share < SPREAD:
             why = result.reason or f"all that agrees is in {100 * share:.0f} % of the image"
             return len(rows), why
@@ -244,8 +245,3 @@ def _joined(matches: list[tuple[Index, Index]]) -> tuple[Index, Index]:
     rows, ids = rows[first], ids[first]
     first = np.sort(np.unique(ids, return_index=True)[1])
     return rows[first], ids[first]
-
-
-def _spread(pixels: Array) -> float:
-    """Return the area of the ellipse with the covariance of (n, 2) pixels."""
-    return float(4.0 * np.pi * np.sqrt(max(np.linalg.det(np.cov(pixels.T, bias=True)), 0.0)))

@@ -39,6 +39,7 @@ from odomap.system.looppairs import (
     similarity_of,
 )
 from odomap.system.loopsides import LoopSide
+from odomap.vision.coverage import coverage
 from odomap.vision.matching import MatchConfig
 
 __all__ = ["Verified", "VerifyConfig", "verify"]
@@ -247,7 +248,7 @@ def _reason(
     if not best.converged:
         return f"{found} inliers do not determine the relative pose"
     for side, features in ((newer, inliers.newer_feature), (matched, inliers.matched_feature)):
-        covered = _spread(side, features[features >= 0])
+        covered = coverage(side.keypoints[features[features >= 0]], side.camera)
         if covered < config.spread:
             return (
                 f"{found} inliers cover {100 * covered:.1f} % of keyframe {side.keyframe_id}, "
@@ -259,15 +260,6 @@ def _reason(
             f"{100 * config.share:.0f} % needed,"
         )
     return ""
-
-
-def _spread(side: LoopSide, features: Index) -> float:
-    """Return the share of the image in the ellipse with the covariance of some features."""
-    if len(features) < 3:
-        return 0.0
-    covariance = np.cov(side.keypoints[features].T, bias=True)
-    area = 4.0 * np.pi * np.sqrt(max(float(np.linalg.det(covariance)), 0.0))
-    return float(area / (side.camera.width * side.camera.height))
 
 
 def _verified(
