@@ -95,7 +95,7 @@ class SideVerifier:
     def verify(self, newer: LoopSide, matched: LoopSide, seed: int) -> Verified:
         """Decide, and measure how the two lie to each other."""
         return verify(
-            newer,
+            newer.without(matched.landmark_ids),  # what both know would speak for the drifted path
             matched,
             self.T_body_camera,
             self.sigma_px,

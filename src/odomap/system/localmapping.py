@@ -162,6 +162,10 @@ class LocalMapper:
             keyframes_culled=len(change.redundant),
         )
 
+    def forget_drifts(self) -> None:
+        """Take the map's covariances for the keyframes' from now on: a loop has changed them."""
+        self._drifts.clear()
+
     # ---- reading ----
 
     def _snapshot(self, keyframe_id: int) -> Snapshot | None:

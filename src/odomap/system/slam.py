@@ -103,7 +103,7 @@ class Slam(VisualSystem):
         )
         depth = (1.0, 0.0) if ranger is None else (ranger.sigma, ranger.calibration)
         sections = _sections(config)
-        self._mapper = _Mapper(
+        self._mapper = LocalMapper(
             self.map, eye.camera, eye.T_body_camera, sections, bias, *depth, ranger is not None
         )
         if not self._is_mapping:
@@ -133,14 +133,6 @@ class Slam(VisualSystem):
 
     def _counts(self) -> Mapping[str, int]:
         return dict(self._mapper.counts)
-
-
-class _Mapper(LocalMapper):
-    """A mapper whose keyframes' uncertainty can be counted from the map's anew."""
-
-    def forget_drifts(self) -> None:
-        """Begin with what the map says of how sure keyframes are: a loop has made them surer."""
-        self._drifts.clear()
 
 
 def _sections(config: Config) -> MappingSections:
