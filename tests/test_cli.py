@@ -151,7 +151,7 @@ def test_no_words_prints_help_and_fails(cli):
         (
             ["frobnicate"],
             "one of run, localize, continue, demo, calibrate, eval, optimize, bundle, export, "
-            "info, view, config, doctor expected",
+            "vocabulary, info, view, config, doctor expected",
         ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),
