@@ -52,7 +52,7 @@ class TrackingConfig:
     min_inliers: Annotated[int, Limits(least=4)] = 15
     """Observations that must agree with a pose for it to count as tracked."""
     min_coverage: Fraction = 0.08
-    """Part of the image that they must be spread over."""
+    """Part of the image that they must be spread over, or half of what it was at the start."""
     keyframe_ratio: Fraction = 0.85
     """A keyframe is made when inliers fall below this fraction of those just after the last one."""
     keyframe_motion: NotNegative = 0.04

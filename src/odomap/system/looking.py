@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
 from odomap.sensors.frame import Frame
-from odomap.system.association import Association, TrackingConfig, View
+from odomap.system.association import Association, View
 from odomap.system.eye import Eye
 from odomap.system.locating import Located
 from odomap.vision.coverage import coverage
@@ -107,16 +107,23 @@ class Looker:
         return np.array_equal(before, self._raw) and float(before.std()) > BLANK
 
 
-def doubt(located: Located, config: TrackingConfig, view: View, camera: Camera) -> str:
-    """Say in a sentence why a pose is not to be believed; empty if it is."""
-    needed = config.min_inliers
+def doubt(located: Located, needed: int, coverage_needed: float, view: View, camera: Camera) -> str:
+    """Say in a sentence why a pose is not to be believed; empty if it is.
+
+    Args:
+        located: the pose, and which observations agree with it.
+        needed: how many must.
+        coverage_needed: part of the image that they must be spread over.
+        view: what it was found in.
+        camera: the pinhole of the view.
+    """
     if located.num_inliers >= needed:
         covered = coverage(located.pixels[located.inliers], camera)
-        if covered >= config.min_coverage:
+        if covered >= coverage_needed:
             return ""
         return (
             f"what agrees covers {100 * covered:.1f} % of the image, "
-            f"{100 * config.min_coverage:g} % needed: something before the lens?"
+            f"{100 * coverage_needed:.1f} % needed: something before the lens?"
         )
     contrast = float(view.pyramid[-1].std())
     if contrast < BLANK:

@@ -126,6 +126,14 @@ class Path:
         Ad = se3_adjoint(se3_inverse(frame.T_keyframe_body))
         return np.asarray(Ad @ self._map.covariance(frame.keyframe_id) @ Ad.T + frame.covariance)
 
+    def gap_covariance(self, stamp_ns: int) -> Array:
+        """Return how unsure the last pose (6, 6) is by now: a metre and half a radian a second."""
+        if not len(self):
+            return np.zeros((6, 6))
+        gap = (stamp_ns - self.last.stamp_ns) * 1e-9
+        unseen = (np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5]) + np.abs(self.velocity())) * gap
+        return np.asarray(self.last_covariance() + np.diag(unseen**2))
+
     def trajectory(self) -> Trajectory:
         """Return T_world_body of all frames as known now, with covariances."""
         return _trajectory([(f.stamp_ns, self._pose(f), self.covariance(f)) for f in self._frames])

@@ -40,6 +40,7 @@ from odomap.system.looking import Clock, Look, Looker, Unseen, doubt
 from odomap.system.path import Path, Placed
 from odomap.system.starting import Start, Started, Waiting
 from odomap.system.veil import VEILED, Veil
+from odomap.vision.coverage import coverage
 from odomap.vision.turning import Thumbnail, turn_between
 
 __all__ = ["Known", "Tracker"]
@@ -112,6 +113,7 @@ class Tracker(ABC, Generic[K]):
         self._last: View | None = None
         self.path = Path(map)
         self._since_keyframe = self._lost = self._first_count = self._piece = 0
+        self._coverage = config.min_coverage
         self._wanted: Wanted[K] | None = None
         self._made: int | None = None
 
@@ -163,7 +165,8 @@ class Tracker(ABC, Generic[K]):
         known, located, status = self._locate(self._veil.lifted(look.view), known)
         located = self._of_one_piece(known, located)
         look.clock.lap("track")
-        reason = doubt(located, self._tracking, look.view, self._eye.camera)
+        needed = self._tracking.min_inliers, self._coverage
+        reason = doubt(located, *needed, look.view, self._eye.camera)
         if not reason:
             return self._accept(look, known, located, status)
         is_patient = self._lost < self._tracking.patience or self._veil.is_shown
@@ -193,7 +196,7 @@ class Tracker(ABC, Generic[K]):
     def _begin(self, look: Look) -> Estimate:
         """Start, or start anew after a loss."""
         frame, anew = look.frame, len(self.path) > 0
-        T_world_body, covariance = self.path.last_pose(), self._gap_covariance(frame.stamp_ns)
+        T_world_body, covariance = self.path.last_pose(), self.path.gap_covariance(frame.stamp_ns)
         started = self._start.begin(frame, look.view, T_world_body, covariance)
         look.clock.lap("keyframe")
         if isinstance(started, Waiting):
@@ -203,6 +206,9 @@ class Tracker(ABC, Generic[K]):
         self._begun(started)
         self._piece = int(started.reference.landmark_ids.min()) if anew else 0
         self._made = started.placed[-1].keyframe_id
+        # Where all there is to see is a strip, no more can be asked for.
+        begun = coverage(started.reference.keypoints, self._eye.camera)
+        self._coverage = min(self._tracking.min_coverage, 0.5 * begun)
         self._last = look.view
         for placed in started.placed[:-1]:
             self.path.append_late(placed)
@@ -265,7 +271,7 @@ class Tracker(ABC, Generic[K]):
             last.keyframe_id if last else -1,
             SE3(last.T_keyframe_body) if last else SE3.identity(),
             SE3(self.path.last_pose()),
-            self._gap_covariance(frame.stamp_ns),
+            self.path.gap_covariance(frame.stamp_ns),
             timing=clock.laps,
         )
 
@@ -349,7 +355,7 @@ class Tracker(ABC, Generic[K]):
     def _is_likely(self, known: K, located: Located, stamp_ns: int) -> bool:
         """Say whether the body may be there: near enough for the time unseen, or well attested."""
         moved = np.linalg.norm(located.T_world_body[:3, 3] - self.path.last_pose()[:3, 3])
-        sigma = np.sqrt(np.trace(self._gap_covariance(stamp_ns)[:3, :3]))
+        sigma = np.sqrt(np.trace(self.path.gap_covariance(stamp_ns)[:3, :3]))
         settled, least = self._count_settled(known, located), self._tracking.min_inliers
         if self._veil.is_shown and settled < least:  # the others may be on what hides the known
             return False
@@ -387,11 +393,3 @@ class Tracker(ABC, Generic[K]):
         by = np.linalg.norm(moved[located.inliers], axis=1)
         by = by[np.isfinite(by)]
         return float(np.median(by)) if len(by) else np.inf
-
-    def _gap_covariance(self, stamp_ns: int) -> Array:
-        """Say how unsure the last pose is by now: a metre and half a radian per second unseen."""
-        if not len(self.path):
-            return np.zeros((6, 6))
-        gap = (stamp_ns - self.path.last.stamp_ns) * 1e-9
-        unseen = (np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5]) + np.abs(self.path.velocity())) * gap
-        return np.asarray(self.path.last_covariance() + np.diag(unseen**2))
