@@ -72,10 +72,16 @@ class Growth:
         return int(self.keyframes[0]) - bool(estimates[0].is_keyframe)
 
     def made(self, estimates: Sequence[Estimate]) -> NDArray[np.int64]:
-        """Return how many keyframes were made up to each frame (N,); one may make several."""
+        """Return how many keyframes were made up to each frame (N,).
+
+        One may make several, as the start of a single camera does. The map may hold one only when
+        the next frame is there.
+        """
         marked = np.array([e.is_keyframe for e in estimates], np.int64)
-        more = np.diff(self.keyframes, prepend=self.keyframes[:1] - marked[:1])
-        return np.cumsum(np.maximum(marked, more))
+        came = np.diff(self.keyframes, prepend=self.keyframes[:1] - marked[:1])
+        made = np.cumsum(marked)
+        besides = np.maximum(np.cumsum(np.maximum(came, 0)) - made, 0)
+        return np.asarray(made + np.maximum.accumulate(besides))
 
 
 def environment() -> dict[str, str]:
