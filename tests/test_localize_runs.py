@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,12 +12,15 @@ from odomap.errors import InputError
 from odomap.evaluation.metrics import ate
 from odomap.files.mapfile import load_map, save_map
 from odomap.files.trajectories import read_tum
+from odomap.files.vocabulary import Vocabulary
 from odomap.localize import continue_map, localize
 from odomap.run import chosen_config
+from odomap.savedmap import map_settings
 from odomap.simulation.export import export_euroc
 from odomap.simulation.world import World
 from odomap.sources.open import open as open_source
 from odomap.system.slam import Slam
+from odomap.vision.orb import OrbConfig, extract
 
 FRAMES, MAPPED = 20, 12
 OVERRIDES = (("orb.count", "600"), ("threads.mapping_delay", "1"))
@@ -47,7 +51,7 @@ def mapped(recording, config, tmp_path_factory):
             break
     file = tmp_path_factory.mktemp("maps") / "map.odomap"
     result = slam.finish()
-    save_map(file, result.map, source.rig, settings={"sensors": "stereo"})
+    save_map(file, result.map, source.rig, settings=map_settings(config))
     return file, result.trajectory
 
 
@@ -160,3 +164,23 @@ def test_the_command_line(recording, mapped, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "runs" / "room_continued" / "map.odomap").exists()
     # Again with the settings of the run, as the report says.
     assert main(["localize", *words, "--config", str(folder / "config.yaml")]) == 0
+
+
+def test_another_vocabulary_is_said_and_its_words_are_made_anew(
+    recording, mapped, tmp_path, capsys
+):
+    seen = (recording / "mav0" / "cam0" / "data").glob("*.png")
+    few = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in sorted(seen)[::4]]
+    found = [extract(image, OrbConfig(count=300)).descriptors for image in few]
+    words = tmp_path / "own.odomap-vocabulary"
+    Vocabulary.train(found, branching=6, depth=3).save(words)
+    call = ["localize", str(mapped[0]), str(recording), "--out", str(tmp_path / "out"), "--quiet"]
+    call += ["--max-frames", "4", "--orb.count", "600", "--places.vocabulary", str(words)]
+    assert main(call) == 0
+    out, err = capsys.readouterr()
+    assert "4: 4 localised" in out
+    assert "was made with the vocabulary of odomap: its places are indexed anew with" in err
+    assert "own.odomap-vocabulary" in err
+    words.write_bytes(words.read_bytes()[:-50])
+    assert main(call) == 2
+    assert "own.odomap-vocabulary: " in capsys.readouterr().err

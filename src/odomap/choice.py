@@ -57,10 +57,19 @@ class SystemChoice:
         """Make sure that the map, if there is one, fits.
 
         Raises:
-            InputError: it was made with other cameras, or knows no places.
+            InputError: it was made with other cameras, or knows no places; or the vocabulary by
+                which places are to be recognised cannot be used.
         """
+        if settings.places.vocabulary:
+            from odomap.files.vocabulary import Vocabulary
+
+            Vocabulary.load(settings.places.vocabulary)
         if self.saved is not None:
             self.saved.check(rig, settings)
+
+    def notes(self, settings: "Config") -> list[str]:
+        """Return what is worth knowing about how the map is used, one sentence each."""
+        return [] if self.saved is None else self.saved.notes(settings)
 
     def head(self) -> dict[str, object]:
         """Return what the head of config.yaml says."""

@@ -27,12 +27,9 @@ LATE = ("odomap.geometry.", "odomap.maps.views_kernels")
 RARE = (
     "odomap.geometry.alignransac_kernels",
     "odomap.geometry.horn_kernels",
-    "odomap.vision.inverted",
     "odomap.vision.kmajority",
-    "odomap.vision.vocabulary",
-    "odomap.vision.wordmatching",
 )
-"""Modules that only serve where places are told by words, which is not the default."""
+"""Modules that only serve where loops are closed or words are trained."""
 F = TypeVar("F", bound=Callable[..., object])
 
 

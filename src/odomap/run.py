@@ -190,7 +190,8 @@ def run(
         state |= {"rhythm": rhythm, "is_mapping": is_mapping} | _beside(system.worker)
         if broken is not None:
             state["failure"] = f"tracking stopped: {broken}"
-        finished = _concluded(source, logbook, result, outputs, state, tell)
+        notes = choice.notes(settings)
+        finished = _concluded(source, logbook, result, outputs, state, notes, tell)
     if broken is not None:
         kept = "" if outputs is None else f"; what was tracked before is in {outputs.folder}"
         raise type(broken)(f"{head['data']}: {broken}{kept}") from broken
@@ -313,10 +314,12 @@ def _concluded(
     result: "Result",
     outputs: "Outputs | None",
     state: Mapping[str, object],
+    notes: Sequence[str],
     tell: Callable[[Progress], None],
 ) -> RunResult:
     """Make the numbers, write what is asked for."""
-    metrics, warnings = figures(source, logbook, result, bool(state["is_mapping"]))
+    metrics, found = figures(source, logbook, result, bool(state["is_mapping"]))
+    warnings = [*notes, *found]
     metrics |= state
     if metrics["frames_dropped"]:
         came = metrics["frames"] + metrics["frames_dropped"]

@@ -40,12 +40,15 @@ class SavedMap:
         map: what is remembered.
         rig: the sensors it was made with; None where that is not said.
         sensors: stereo, rgbd or mono; empty where that is not said.
+        vocabulary: by which its places were recognised; empty for that of odomap, None where that
+            is not said.
     """
 
     name: str
     map: Map
     rig: Rig | None = None
     sensors: str = ""
+    vocabulary: str | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> "SavedMap":
@@ -60,7 +63,9 @@ class SavedMap:
         with MapFile(map_file(path)) as file:
             said = file.settings.get("sensors")
             sensors = said if isinstance(said, str) and said in KINDS else ""
-            return cls(str(file.path), file.map(), file.rig, sensors)
+            words = file.settings.get("vocabulary")
+            words = words if isinstance(words, str) else None
+            return cls(str(file.path), file.map(), file.rig, sensors, words)
 
     @classmethod
     def of(cls, map: "SavedMap | Map | str | Path") -> "SavedMap":
@@ -111,6 +116,14 @@ class SavedMap:
                 "same cameras, or their calibration with --rig"
             )
 
+    def notes(self, config: "Config") -> list[str]:
+        """Return what is worth knowing where it is used otherwise than it was made."""
+        words = config.places.vocabulary
+        if self.vocabulary is None or self.vocabulary == words:
+            return []
+        there, here = (name or "the vocabulary of odomap" for name in (self.vocabulary, words))
+        return [f"{self.name}: was made with {there}: its places are indexed anew with {here}"]
+
     def eye(self) -> "Eye":
         """Return the ideal camera whose pixels its features are in.
 
@@ -144,7 +157,7 @@ def map_file(path: str | Path) -> Path:
 
 def map_settings(config: "Config") -> dict[str, Any]:
     """Return what a map file should say about how it was made."""
-    return {"sensors": config.tracking.sensors}
+    return {"sensors": config.tracking.sensors, "vocabulary": config.places.vocabulary}
 
 
 def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:

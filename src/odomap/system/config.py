@@ -29,6 +29,7 @@ from odomap.system.localmap import LocalMapConfig
 from odomap.system.localmapping import MappingConfig
 from odomap.system.loopsearch import ClosingConfig
 from odomap.system.mapping import WindowConfig
+from odomap.system.placeindex import PlacesConfig
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.bootstrap import BootstrapConfig
 from odomap.vision.depth import DepthConfig
@@ -86,6 +87,8 @@ class Config:
     """Which matches become landmarks."""
     culling: CullConfig = field(default_factory=CullConfig)
     """What goes from the map."""
+    places: PlacesConfig = field(default_factory=PlacesConfig)
+    """By which words places are recognised."""
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """When loops are looked for, and closed."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)

@@ -252,6 +252,7 @@ class MapTracker(Tracker[LocalMap]):
         self._turn_later(made.keyframe_id, T_world_body)
         self._shown = made.landmark_ids
         self._most_shown = located.num_inliers
+        self._recognizer.keep_up()
         return made.keyframe_id
 
     def _may_start_anew(self) -> bool:

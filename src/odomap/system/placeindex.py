@@ -17,6 +17,9 @@ Reference: Gálvez-López, Tardós, "Bags of binary words for fast place recogni
 sequences", T-RO 28(5), 2012; Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015, section V-C.
 """
 
+import logging
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +28,7 @@ from odomap.system.revisits import group_scores
 from odomap.vision.places import Places
 from odomap.vision.vocabulary import BagOfWords, VocabularyTree
 
-__all__ = ["PlaceIndex", "described"]
+__all__ = ["PlaceIndex", "PlacesConfig", "described"]
 
 Descriptors = NDArray[np.uint8]
 Index = NDArray[np.int64]
@@ -36,6 +39,15 @@ GROUP = 6
 """Keyframes of a place: one and those that share most landmarks with it."""
 GROUP_SHARE = 0.3
 """Summed score of a place relative to that of the best one."""
+
+
+@dataclass(frozen=True)
+class PlacesConfig:
+    """By which words places are recognised."""
+
+    vocabulary: str = ""
+    """File of a vocabulary, as `odomap vocabulary train` writes it; none: that which comes with
+    odomap. A map holds no words: one made with another vocabulary gets them anew."""
 
 
 class PlaceIndex:
@@ -51,7 +63,10 @@ class PlaceIndex:
         self._places = Places(vocabulary.num_words)
         # The nodes of what is in; None for keyframes without features that have words.
         self._nodes: dict[int, NDArray[np.int32] | None] = {}
-        self.keep_up(map.num_keyframes)
+        if self.keep_up(map.num_keyframes) == 0 and len(self):
+            logging.getLogger(__name__).info(
+                "%d keyframes indexed by a vocabulary of %d words", len(self), vocabulary.num_words
+            )
 
     def __len__(self) -> int:
         return len(self._places)

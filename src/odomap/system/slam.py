@@ -48,8 +48,9 @@ class Slam(VisualSystem):
         rhythm: which thread runs what; see `rhythms`.
         map: a map to go on with; default a new one.
         is_mapping: whether the map is changed; if not, frames are only placed in it.
-        vocabulary: makes the words by which places are recognised; default that which comes with
-            odomap, read where loops are looked for (`closing.enabled`).
+        vocabulary: makes the words by which places are recognised; default that which the
+            configuration names (`places.vocabulary`). A map holds no words: one made with another
+            vocabulary gets them anew.
 
     Attributes:
         map: keyframes and landmarks.
@@ -58,6 +59,7 @@ class Slam(VisualSystem):
     Raises:
         CalibrationError: the rig does not carry what the configuration says.
         ConfigError: there is no such rhythm.
+        InputError: the vocabulary that the configuration names cannot be used.
     """
 
     def __init__(
@@ -70,7 +72,9 @@ class Slam(VisualSystem):
         vocabulary: VocabularyTree | None = None,
     ) -> None:
         config = preset(preset_for(rig)) if config is None else config
-        self._is_mapping, self._vocabulary = is_mapping, vocabulary
+        self._is_mapping = is_mapping
+        named = config.places.vocabulary or None
+        self._words = Vocabulary.load(named) if vocabulary is None else vocabulary
         super().__init__(Sight.of(rig, config), config, rhythm, map)
 
     def _stages(self, sight: Sight, config: Config) -> Stages:
@@ -94,6 +98,7 @@ class Slam(VisualSystem):
             config.matching,
             config.tracking.min_inliers,
             config.orb.scale,
+            self._words,
         )
         if follows and self.map.num_keyframes:
             start = RecognisedStart(self.map, eye, keyframes, recognizer, config.orb)
@@ -123,8 +128,7 @@ class Slam(VisualSystem):
             with_scale,
             sections.matching,
         )
-        words = Vocabulary.load() if self._vocabulary is None else self._vocabulary
-        search, forget = LoopSearch(words, config.closing), self._mapper.forget_drifts
+        search, forget = LoopSearch(self._words, config.closing), self._mapper.forget_drifts
         return LoopCloser(self.map, search, verifier, with_scale, config.closing, forget)
 
     @property
