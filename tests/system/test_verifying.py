@@ -298,6 +298,21 @@ def test_the_same_poster_on_another_wall():
     assert found.num_inliers >= 30
 
 
+def test_what_is_far_ahead_and_small_is_enough_where_nothing_else_must_show():
+    rng = np.random.default_rng(8)
+    far = World(
+        rng.uniform([-4.0, -1.5, 30.0], [4.0, 1.5, 50.0], (300, 3)),
+        rng.integers(0, 256, (300, 32), np.uint8),
+        rng.uniform(35, 60, 300),
+    )
+    sides = side(far, HERE @ pose(metres=1.0, degrees=5.0), 88, seed=2), side(far, HERE, 3)
+    found = check(*sides, spread=0.2)
+    assert found.is_accepted, found.reason
+    # If it had to be spread more than what there is to be seen, it would be refused.
+    refused = check(*sides, spread=0.2, spread_share=1.0)
+    assert "cover" in refused.reason
+
+
 def test_identical_doors_all_over_the_image():
     """They are spread; but of what must show around them nothing does."""
     rng = np.random.default_rng(6)

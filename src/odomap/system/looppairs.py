@@ -28,6 +28,7 @@ from odomap.vision.matching import KeypointGrid, MatchConfig, match_projected, n
 from odomap.vision.wordmatching import match_words
 
 __all__ = [
+    "Expected",
     "FeatureNoise",
     "LoopPairs",
     "match_expected",
@@ -74,6 +75,23 @@ class LoopPairs:
         """Feature and landmark of the newer, feature and landmark of the matched."""
         newer = self.newer_feature, self.newer_landmark
         return *newer, self.matched_feature, self.matched_landmark
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Where landmarks of one side must show in the other's image, if the similarity is right.
+
+    Attributes:
+        in_newer: (n, 2) pixels of the newer keyframe's image.
+        in_matched: (m, 2) of the matched one's.
+    """
+
+    in_newer: Array
+    in_matched: Array
+
+    def __len__(self) -> int:
+        """Return how many, in the image that must show fewer."""
+        return min(len(self.in_newer), len(self.in_matched))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,20 +153,19 @@ def match_expected(
     level_scale: float,
     radius_px: float,
     matching: MatchConfig,
-) -> tuple[LoopPairs, int]:
+) -> tuple[LoopPairs, Expected]:
     """Look for the landmarks of either group in the other's image.
 
     Returns:
-        The pairs, and how many landmarks should have been found in the image that should show
-        fewer.
+        The pairs, and where landmarks should have been found.
     """
     T = similarity_of(S)
-    there, expected_there = _search(newer, matched, T, level_scale, radius_px, matching)
-    back, expected_back = _search(matched, newer, sim3_inverse(T), level_scale, radius_px, matching)
+    there, in_matched = _search(newer, matched, T, level_scale, radius_px, matching)
+    back, in_newer = _search(matched, newer, sim3_inverse(T), level_scale, radius_px, matching)
     from_newer = _completed(there, newer, matched, back)
     from_matched = _completed(back, matched, newer, there)[:, [2, 3, 0, 1]]
     rows = np.concatenate([from_newer, from_matched])
-    return _distinct(rows), min(expected_there, expected_back)
+    return _distinct(rows), Expected(in_newer, in_matched)
 
 
 def _completed(found: Index, side: LoopSide, other: LoopSide, back: Index) -> Index:
@@ -178,10 +195,10 @@ def _search(
     level_scale: float,
     radius_px: float,
     matching: MatchConfig,
-) -> tuple[Index, int]:
+) -> tuple[Index, Array]:
     """Return the (M,) features of the other side at a side's landmarks, -1 for none.
 
-    The second number is how many landmarks should show.
+    Beside them the (n, 2) pixels of those landmarks that should show.
     """
     scale = np.cbrt(np.linalg.det(T_other_side[:3, :3]))
     points = side.points_camera @ T_other_side[:3, :3].T + T_other_side[:3, 3]
@@ -209,7 +226,7 @@ def _search(
         KeypointGrid.of(keypoints, (other.camera.height, other.camera.width)),
         matching,
     )
-    return found, int(np.count_nonzero(ahead))
+    return found, pixels[ahead]
 
 
 def _distinct(rows: Index) -> LoopPairs:

@@ -9,10 +9,10 @@ measurement that a loop edge is made of, so nothing here reads where the drifted
     landmarks of either group, projected by S into the other's image → more pairs
     min over S of Σ ρ(|x - π(S⁻¹ q)|²/σ²) + ρ(|y - π(S p)|²/σ²)  →  S and its covariance.
 
-A place counts only if enough points agree, if they are spread over both images (a single poster
-looks the same on every wall), and if they are a good part of what S says must show (of one door
-among identical ones the door agrees, and nothing around it). Each refusal says what was found, what
-was needed, and where. Nothing is drawn but from the caller's seed.
+A place counts only if enough points agree, if they are spread over both images, or over what must
+show of the other side there (a single poster looks the same on every wall), and if they are a good
+part of what must show (of one door among identical ones the door agrees, and nothing around it).
+Each refusal says what was found, what was needed, and where. Draws come from the caller's seed.
 
 Cost: O(samples · pairs) and O(landmarks · features in a circle); some 5 ms.
 
@@ -30,6 +30,7 @@ from odomap.geometry.lie import sim3_adjoint
 from odomap.geometry.pnp import solve_pnp
 from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
 from odomap.system.looppairs import (
+    Expected,
     FeatureNoise,
     LoopPairs,
     match_expected,
@@ -65,6 +66,9 @@ class VerifyConfig:
     """Points that must agree at last."""
     spread: Fraction = 0.05
     """Share of each image that they must cover: the ellipse with the pixels' covariance."""
+    spread_share: Fraction = 0.25
+    """Part of what must show that is enough to be covered where that is little of an image, as of a
+    road seen from further back: half its width and half its height."""
     share: Fraction = 0.2
     """Least part of the landmarks expected to show that must agree."""
     ransac_iterations: Count = 300
@@ -238,7 +242,7 @@ def _reason(
     matched: LoopSide,
     inliers: LoopPairs,
     best: Alignment,
-    expected: int,
+    expected: Expected,
     config: VerifyConfig,
 ) -> str:
     """Say what is missing for two keyframes to show one place; empty if nothing is."""
@@ -247,16 +251,20 @@ def _reason(
         return f"{found} inliers of {config.min_inliers} needed"
     if not best.converged:
         return f"{found} inliers do not determine the relative pose"
-    for side, features in ((newer, inliers.newer_feature), (matched, inliers.matched_feature)):
+    for side, features, pixels in (
+        (newer, inliers.newer_feature, expected.in_newer),
+        (matched, inliers.matched_feature, expected.in_matched),
+    ):
         covered = coverage(side.keypoints[features[features >= 0]], side.camera)
-        if covered < config.spread:
+        needed = min(config.spread, config.spread_share * coverage(pixels, side.camera))
+        if covered < needed:
             return (
                 f"{found} inliers cover {100 * covered:.1f} % of keyframe {side.keyframe_id}, "
-                f"{100 * config.spread:.1f} % needed,"
+                f"{100 * needed:.1f} % needed,"
             )
-    if found < config.share * expected:
+    if found < config.share * len(expected):
         return (
-            f"{found} inliers of {expected} landmarks expected to show, "
+            f"{found} inliers of {len(expected)} landmarks expected to show, "
             f"{100 * config.share:.0f} % needed,"
         )
     return ""
