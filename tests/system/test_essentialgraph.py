@@ -1,5 +1,7 @@
 """The essential graph: a circuit whose drift, also of scale, one loop takes away; false loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -196,3 +198,62 @@ def test_units_of_a_loop_are_those_of_its_keyframes():
     assert found.is_accepted
     np.testing.assert_allclose(found.Ts_world_body, Ts, atol=1e-8)
     np.testing.assert_allclose(found.scales, scales, atol=1e-8)
+
+
+def in_pieces(true, begins, rng=None, scale=1.0):
+    """Return a chain that was lost where a piece begins, and went on somewhere, in other units."""
+    Ts = drifted(true, rng)
+    parts = essentials(Ts)
+    parts.parent[begins] = -1
+    away = sim3_exp(np.array([30.0, -20.0, 5.0, 0.3, -1.0, 2.0, np.log(scale)]))
+    moved = away @ Ts[begins:]
+    moved[:, :3, :3] /= scale
+    Ts[begins:] = moved
+    is_far = (parts.pairs < begins).any(axis=1) & (parts.pairs >= begins).any(axis=1)
+    return replace(parts, pairs=parts.pairs[~is_far])
+
+
+@pytest.mark.parametrize(("with_scale", "scale"), [(False, 1.0), (True, 1.0), (True, 0.4)])
+def test_a_loop_between_two_pieces_moves_all_of_the_newer_one(with_scale, scale):
+    true = circle(80)
+    parts = in_pieces(true, 50, scale=scale)
+    Z = se3_inverse(true[4]) @ true[76]
+    found = correct(parts, loop(Z, (4, 76), 1.0 / scale), with_scale)
+    assert found.is_accepted
+    assert found.is_merging.all()
+    assert errors(found.Ts_world_body, true).max() < 1e-6
+    np.testing.assert_allclose(found.Ts_world_body[:50], parts.Ts_world_body[:50], atol=1e-9)
+    np.testing.assert_allclose(found.scales[50:], 1.0 / scale, atol=1e-9)
+    np.testing.assert_allclose(found.scales[:50], 1.0, atol=1e-9)
+    # How sure the newer piece is comes from the loop alone: unsurer the farther away from it.
+    spread = np.trace(found.covariances[:, :3, :3], axis1=1, axis2=2)
+    assert spread[76] < spread[70] < spread[50]
+
+
+def test_a_piece_that_no_loop_ties_stays_where_it_is():
+    true = circle(80)
+    parts = in_pieces(true, 40, np.random.default_rng(7))
+    inside = loop(se3_inverse(true[42]) @ true[78], (42, 78))
+    found = correct(parts, inside, False)
+    assert found.is_accepted
+    assert not found.is_merging.any()
+    np.testing.assert_allclose(found.Ts_world_body[:41], parts.Ts_world_body[:41], atol=1e-9)
+    assert np.linalg.norm(found.Ts_world_body[78] - parts.Ts_world_body[78]) > 1e-3
+    np.testing.assert_allclose(found.covariances[40], parts.covariances[40], rtol=1e-6, atol=1e-9)
+
+
+def test_of_several_loops_between_two_pieces_the_false_one_is_not_believed():
+    true = circle(80)
+    parts = in_pieces(true, 40, np.random.default_rng(8))
+    ends = [(4, 76), (30, 50), (2, 78), (35, 45)]
+    Zs = np.array([se3_inverse(true[i]) @ true[j] for i, j in ends])
+    Zs[1] = Zs[1] @ se3_exp(np.array([3.0, -2.0, 1.0, 0.0, 0.5, 0.0]))
+    found = correct(parts, loop(Zs, ends), False)
+    assert found.is_accepted
+    assert found.is_believed.tolist() == [True, False, True, True]
+    assert found.is_merging.all()
+    assert errors(found.Ts_world_body, true)[[0, 45, 76]].max() < 0.2
+    again = replace(parts, loops=loop(Zs[[0, 2]], [ends[0], ends[2]]))
+    contradicted = correct(again, loop(Zs[1], ends[1]), False)
+    assert not contradicted.is_accepted
+    assert not contradicted.is_merging.any()

@@ -6,8 +6,9 @@
 
 Edges are those that were measured. A keyframe that no measured edge ties to its parent in the
 spanning tree is tied to it by where both are, with unit information: odometry keeps no edges, and a
-graph in pieces is of no use. Where keyframes have scales of their own the graph is one of
-similarities: S_k = [s R, t] and S_i_j = [s R, t].
+graph in pieces is of no use. Only the pieces of a map that are apart (`maps/atlas`) stay so. Where
+keyframes have scales of their own the graph is one of similarities: S_k = [s R, t] and S_i_j =
+[s R, t].
 
 Reference: G. Grisetti, R. Kümmerle, C. Stachniss, W. Burgard, "A tutorial on graph-based SLAM",
 IEEE Intelligent Transportation Systems Magazine 2(4), 2010.
@@ -24,6 +25,8 @@ from odomap.files.clouds import write_ply
 from odomap.files.g2o import write_g2o
 from odomap.files.trajectories import write_tum
 from odomap.geometry.trajectory import Trajectory
+from odomap.maps.atlas import beginnings
+from odomap.maps.edges import GAP, EdgeTable
 from odomap.maps.map import Map
 from odomap.maps.states import compose, inverse
 from odomap.maps.surface import Surface
@@ -51,10 +54,10 @@ def map_graph(map: Map) -> tuple[PoseGraph, int]:
     """Return the pose graph of a map, and how many of its edges were not measured.
 
     Nodes are the living keyframes and the culled ones that an edge names; the root of the spanning
-    tree is held.
+    tree is held. Across a gap there is no edge.
     """
     with map.lock:
-        alive, edges = map.keyframe_ids, map.edges()
+        alive, edges, begins = map.keyframe_ids, _measured(map.edges()), beginnings(map)
         ids = np.unique(np.concatenate([alive, edges.i, edges.j]))
         Ts = map.Ts_world_body(ids)
         scales = np.array([map.scale(k) for k in ids.tolist()])
@@ -64,6 +67,7 @@ def map_graph(map: Map) -> tuple[PoseGraph, int]:
         [p >= 0 and frozenset((k, p)) not in tied for k, p in zip(ids.tolist(), parents.tolist())],
         np.bool_,
     )
+    child &= ~np.isin(ids, begins)
     row, holder = np.flatnonzero(child), np.searchsorted(ids, parents[child])
     links = compose(inverse((Ts[holder], scales[holder])), (Ts[row], scales[row]))
     is_rigid = bool((scales == 1.0).all() and (edges.scales_i_j == 1.0).all())
@@ -82,6 +86,19 @@ def map_graph(map: Map) -> tuple[PoseGraph, int]:
         is_fixed=parents == -1,
     )
     return graph, len(row)
+
+
+def _measured(edges: EdgeTable) -> EdgeTable:
+    """Return the edges that are none across a gap."""
+    keep = np.array(edges.kind, str) != GAP
+    return EdgeTable(
+        edges.i[keep],
+        edges.j[keep],
+        edges.Ts_i_j[keep],
+        edges.scales_i_j[keep],
+        edges.information[keep],
+        tuple(kind for kind in edges.kind if kind != GAP),
+    )
 
 
 def _matrices(Ts: Array, scales: Array) -> Array:

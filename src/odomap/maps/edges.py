@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
 
-__all__ = ["EdgeTable", "Edges"]
+__all__ = ["GAP", "LOOP", "EdgeTable", "Edges"]
+
+LOOP = "loop"
+"""Kind of the edges that say where two keyframes of one place lie to each other."""
+GAP = "gap"
+"""Kind of the edges that say where nothing is known of that: a piece begins (`atlas`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +77,11 @@ class Edges:
         self._information[row] = information
         self._kind.append(kind)
         return row
+
+    def ends_of_gaps(self) -> set[int]:
+        """Return the keyframes on either side of gaps."""
+        rows = [row for row, kind in enumerate(self._kind) if kind == GAP]
+        return set(self._ends[rows].ravel().tolist())
 
     def restore(self, table: EdgeTable) -> None:
         """Fill an empty table with the edges of another."""

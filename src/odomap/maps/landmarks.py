@@ -179,6 +179,24 @@ class Landmarks:
         self._by_anchor.append(anchors, slots.astype(np.int32))
         return ids
 
+    def graft(self, columns: Mapping[str, NDArray[Any]], offset: int) -> NDArray[np.int64]:
+        """Take in the landmarks of another table, with new ids in the order of those they had.
+
+        Args:
+            columns: what `dump` returned.
+            offset: its keyframe k is called offset + k here.
+
+        Returns:
+            (M,) their slots here, in the order of `columns`.
+        """
+        order = np.argsort(columns["id"], kind="stable")
+        anchors = offset + columns["anchor"].astype(np.int64)
+        look, places = columns["descriptor"], columns["p_anchor"]
+        slots = np.empty(len(order), np.int64)
+        slots[order] = self.slots(self.add(anchors[order], places[order], look[order]))
+        self.seen[slots], self.expected[slots] = columns["seen"], columns["expected"]
+        return slots
+
     def reanchor(
         self,
         slots: NDArray[np.int64],

@@ -15,12 +15,14 @@ system, 2015.
 """
 
 import time
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odomap.maps import writing
+from odomap.maps.absorbing import Absorbed, absorb_tables
 from odomap.maps.columns import distinct, distinct_in_order, members
 from odomap.maps.copying import Copying
 from odomap.maps.cutting import Cut, snapshot_from
@@ -41,7 +43,7 @@ LARGE = 50_000
 
 
 class Map(Surroundings):
-    """What is remembered of one connected part of the world.
+    """What is remembered of a part of the world, in one piece or several (`odomap.maps.atlas`).
 
     Keyframes and their poses come from `Skeleton`, landmarks and observations from `Sightings`,
     what lies around a place from `Surroundings`; here are the operations on all of them:
@@ -121,12 +123,50 @@ class Map(Surroundings):
         m.version, m.epoch = tables.version, tables.epoch
         return m
 
+    def absorb(self, other: "Map") -> Absorbed:
+        """Take in all of another map, as a piece of this one below a gap.
+
+        Where the two lie to each other is not known: keyframes stay where they were in their own
+        world, until a loop between the two says more. Nothing changes of what was there before,
+        and the next keyframe hangs from where it would have.
+
+        Args:
+            other: stays as it is.
+
+        Returns:
+            What its keyframes and landmarks are called here.
+        """
+        tables = other.dump()
+        with self.lock:
+            offset, holder = self._next_keyframe, self._newest
+            absorbed = absorb_tables(
+                tables,
+                offset,
+                holder,
+                self.version,
+                self.states,
+                self._tree,
+                self._landmarks,
+                self._observations,
+                self._edges,
+            )
+            for keyframe in tables.keyframes:
+                self._keyframes[offset + keyframe.id] = replace(keyframe, id=offset + keyframe.id)
+            self._next_keyframe = offset + tables.next_keyframe
+            self.version += tables.version + 1
+            if holder < 0 <= tables.newest:
+                self._newest = offset + tables.newest
+            elif absorbed.root_id >= 0:
+                self.begin_piece(absorbed.root_id)
+        return absorbed
+
     def cull_keyframes(self, keyframe_ids: ArrayLike) -> None:
         """Remove keyframes that add nothing, and keep placed what hangs from them.
 
         Each leaves a stub below its parent; its landmarks are stored relative to the oldest
         keyframe that still sees them, or else to the parent; its observations go. Those culled
-        already are passed over. Several are culled one by one, with the lock free between.
+        already are passed over, and so are both ends of a gap, which keep the pieces of the map
+        apart. Several are culled one by one, with the lock free between.
 
         Args:
             keyframe_ids: (n,) keyframes; one at least must remain in the map.
@@ -139,7 +179,7 @@ class Map(Surroundings):
             if n:
                 time.sleep(PAUSE_S)
             with self.lock:
-                if k in self._keyframes:
+                if k in self._keyframes and k not in self._edges.ends_of_gaps():
                     self._cull(k)
 
     def _cull(self, k: int) -> None:

@@ -82,11 +82,24 @@ class Observations:
 
     def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill an empty table with what `dump` returned."""
+        self.graft(columns, 0, columns["landmark"].astype(np.int64))
+
+    def graft(
+        self, columns: Mapping[str, NDArray[Any]], offset: int, slots: NDArray[np.int64]
+    ) -> None:
+        """Take in another table; all lists keep the order they had.
+
+        Args:
+            columns: what `dump` returned.
+            offset: its keyframe k is called offset + k here.
+            slots: (R,) the landmarks of its rows, as they are here.
+        """
         rows, others = self._new_rows(len(columns["keypoint"])), columns["by_landmark"]
-        self._keyframe[rows], self._landmark[rows] = columns["keyframe"], columns["landmark"]
+        keyframes = offset + columns["keyframe"].astype(np.int64)
+        self._keyframe[rows], self._landmark[rows] = keyframes, slots
         self._keypoint[rows], self._alive[rows] = columns["keypoint"], True
-        self._by_keyframe.append(columns["keyframe"].astype(np.int64), rows.astype(np.int32))
-        self._by_landmark.append(columns["landmark"][others].astype(np.int64), others)
+        self._by_keyframe.append(keyframes, rows.astype(np.int32))
+        self._by_landmark.append(slots[others], rows[others].astype(np.int32))
 
     def read(
         self, rows: NDArray[np.int64] | NDArray[np.int32]

@@ -16,9 +16,9 @@ import threading
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from odomap.maps.edges import Edges, EdgeTable
+from odomap.maps.edges import GAP, Edges, EdgeTable
 from odomap.maps.keyframes import Keyframe
-from odomap.maps.states import States, compose
+from odomap.maps.states import States, compose, inverse
 from odomap.maps.tree import ABSENT, ALIVE, STUB, Tree
 
 __all__ = ["Skeleton"]
@@ -121,6 +121,11 @@ class Skeleton:
         with self.lock:
             return int(self._tree.parent[self._known(keyframe_id)])
 
+    def tree(self) -> Tree:
+        """Return the spanning tree, copied."""
+        with self.lock:
+            return self._tree.twin()
+
     def T_world_body(self, keyframe_id: int) -> NDArray[np.float64]:
         """Return the (4, 4) pose of a keyframe, also of a culled one."""
         return np.asarray(self.Ts_world_body(np.array([keyframe_id]))[0])
@@ -187,6 +192,23 @@ class Skeleton:
             ends = self._known(i), self._known(j)
             self.version += 1
             return self._edges.add(*ends, T_i_j, information, kind, scale_i_j)
+
+    def begin_piece(self, keyframe_id: int) -> None:
+        """Say that where a keyframe is relative to its parent is not known: an edge of kind "gap".
+
+        It begins a piece of the map (`odomap.maps.atlas`). The root of the tree needs no saying.
+
+        Args:
+            keyframe_id: a living keyframe without children yet.
+        """
+        with self.lock:
+            parent = self.parent(keyframe_id)
+            if parent < 0:
+                return
+            S_i, S_j = (self.states.placements(np.array([k])) for k in (parent, keyframe_id))
+            T, scale = compose(inverse(S_i), S_j)
+            none = np.zeros((6, 6))
+            self.add_edge(parent, keyframe_id, T[0], none, GAP, scale_i_j=float(scale[0]))
 
     def edges(self) -> EdgeTable:
         """Return all edges, copied."""

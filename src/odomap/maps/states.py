@@ -131,9 +131,14 @@ class States:
 
     def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill an empty table with what `dump` returned."""
-        self.extend(len(columns["scales"]))
+        self.graft(columns, 0)
+
+    def graft(self, columns: Mapping[str, NDArray[Any]], offset: int) -> None:
+        """Take in another table; the row of its keyframe k is offset + k here."""
+        end = offset + len(columns["scales"])
+        self.extend(end)
         for name in _COLUMNS:
-            getattr(self, name)[:] = columns[name]
+            getattr(self, name)[offset:end] = columns[name]
 
     def placements(self, rows: NDArray[np.int64]) -> Placement:
         """Return copies of the (n, 4, 4) poses and (n,) scales of some rows."""

@@ -65,16 +65,36 @@ class Tree:
 
     def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill an empty tree with what `dump` returned."""
+        self.graft(columns, 0, -1, 0)
+
+    def graft(
+        self, columns: Mapping[str, NDArray[Any]], offset: int, holder: int, version: int
+    ) -> int:
+        """Enter another tree below a living keyframe.
+
+        Args:
+            columns: what `dump` returned.
+            offset: its keyframe k is called offset + k here.
+            holder: its root's parent, −1 if this tree is empty.
+            version: of the map; all of it comes after that.
+
+        Returns:
+            What its root is called here, −1 if it has none.
+        """
         rows = len(columns["status"])
-        self.status = grown(self.status, rows)
-        self.parent = grown(self.parent, rows, fill=-1)
-        self.created = grown(self.created, rows)
-        self._Ts_parent_self = grown(self._Ts_parent_self, rows)
-        self._scales_parent_self = grown(self._scales_parent_self, rows)
-        self.status[:rows], self.parent[:rows] = columns["status"], columns["parent"]
-        self.created[:rows] = columns["created"]
-        self._Ts_parent_self[:rows] = columns["Ts_parent_self"]
-        self._scales_parent_self[:rows] = columns["scales_parent_self"]
+        end, status, parent = offset + rows, columns["status"], columns["parent"]
+        self.status = grown(self.status, end)
+        self.parent = grown(self.parent, end, fill=-1)
+        self.created = grown(self.created, end)
+        self._Ts_parent_self = grown(self._Ts_parent_self, end)
+        self._scales_parent_self = grown(self._scales_parent_self, end)
+        is_there, is_root = status != ABSENT, (status == ALIVE) & (parent < 0)
+        below = np.where(is_root, holder, np.where(parent < 0, -1, parent + offset))
+        self.status[offset:end], self.parent[offset:end] = status, below
+        self.created[offset:end] = np.where(is_there, columns["created"] + version, 0)
+        self._Ts_parent_self[offset:end] = columns["Ts_parent_self"]
+        self._scales_parent_self[offset:end] = columns["scales_parent_self"]
+        return offset + int(np.argmax(is_root)) if is_root.any() else -1
 
     def twin(self) -> "Tree":
         """Return the same tree, copied."""

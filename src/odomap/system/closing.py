@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from odomap.geometry.camera import Camera
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.closure import Closure, Reading, carry_covariance, read_essentials
+from odomap.system.closure import Closure, Reading, Tie, carry_covariance, read_essentials
 from odomap.system.covisibility import Acquaintance
 from odomap.system.essentialgraph import Essentials, LoopEdges, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
@@ -191,8 +191,9 @@ class LoopCloser:
                 )
                 corrected = correct(essentials, edge, self._with_scale)
                 if corrected.is_accepted:
-                    loops.append(replace(loop, is_accepted=True))
-                    return loops, Closure(*ends, found, essentials, corrected)
+                    merges = bool(corrected.is_merging[0])
+                    loops.append(replace(loop, is_accepted=True, merges=merges))
+                    return loops, Closure((Tie(*ends, found),), essentials, corrected)
                 loop = replace(loop, reason=corrected.reason)
             loops.append(loop)
         return loops, None
@@ -277,8 +278,9 @@ def _log(loops: list[Loop]) -> None:
     for loop in loops:
         ends = loop.keyframe_id, loop.matched_id
         if loop.is_accepted:
-            text = "keyframe %d is back at %d: %d inliers"
-            logging.getLogger(__name__).info(text, *ends, loop.num_inliers)
+            text = "keyframe %d is back at %d: %d inliers%s"
+            merged = ", two pieces are one" if loop.merges else ""
+            logging.getLogger(__name__).info(text, *ends, loop.num_inliers, merged)
         else:
             text = "keyframe %d is not back at %d: %s"
             logging.getLogger(__name__).info(text, *ends, loop.reason)

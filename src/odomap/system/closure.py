@@ -1,6 +1,7 @@
 """A loop closed: what is read off the map for it, and what is written into it.
 
-Reading takes a few numbers of every keyframe (`Essentials`). A keyframe that was culled is a stub
+Reading takes a few numbers of every keyframe (`Essentials`), and leaves out the steps of the tree
+across gaps, which measured nothing. A keyframe that was culled is a stub
 below its parent; where a loop was measured to one, the edge goes to the parent,
 
     S_p_q = (S_p⁻¹ S_i) Z_ij (S_j⁻¹ S_q),
@@ -8,7 +9,8 @@ below its parent; where a loop was measured to one, the edge goes to the parent,
 and says the same. Writing moves each keyframe by its correction, S ← S_corrected S_read⁻¹ S_now.
 Keyframes that came since follow their parents (`maps/writing`), and are as much surer as these are:
 Σ = Ad Σ_parent Adᵀ + Q, their growth Q staying what odometry said it was. At last landmarks of both
-sides that are one point are fused, and what either side shows of the other's is observed.
+sides that are one point are fused, and what either side shows of the other's is observed. Loops
+that were found together, as between two maps, are written together.
 
 Cost: O(K) over some numbers per keyframe, and O(landmarks fused).
 
@@ -17,11 +19,14 @@ T-RO 2015, section VII-C (loop fusion).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.maps.atlas import beginnings
+from odomap.maps.edges import LOOP
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import compose, inverse
@@ -29,13 +34,10 @@ from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
 
-__all__ = ["LOOP", "Closure", "Reading", "carry_covariance", "read_essentials"]
+__all__ = ["Closure", "Reading", "Tie", "carry_covariance", "read_essentials"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-LOOP = "loop"
-"""Kind of the edges in the map that loops leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,7 @@ class Reading:
         covariances: (K, 6, 6).
         loops: closed before, by keyframe ids.
         parent, growth, pairs: of `Covisibility`, of all keyframes there ever were.
+        begins: (n,) keyframes that begin a piece of the map.
     """
 
     snapshot: Snapshot
@@ -55,19 +58,21 @@ class Reading:
     parent: Index
     growth: Array
     pairs: Index
+    begins: Index
 
     def essentials(self) -> Essentials:
         """Return what an essential graph is made of."""
         ids = self.snapshot.keyframe_ids
         row = np.full(len(self.parent) + 1, -1)
         row[ids] = np.arange(len(ids))
-        pairs = row[self.pairs]
+        pairs, parent = row[self.pairs], self.parent.copy()
+        parent[self.begins] = -1
         return Essentials(
             ids,
             self.snapshot.Ts_world_body,
             self.snapshot.scales,
             self.covariances,
-            row[self.parent[ids]],
+            row[parent[ids]],
             self.growth[ids],
             pairs[(pairs >= 0).all(axis=1)],
             self.loops._replace(i=row[self.loops.i], j=row[self.loops.j]),
@@ -85,9 +90,10 @@ def read_essentials(map: Map, known: Covisibility) -> Reading:
     with map.lock:
         snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
         covariances = map.states.covariances[snapshot.keyframe_ids]
-        loops = _read_loops(map)
+        loops, begins = _read_loops(map), beginnings(map)
     growth = known.growth.copy()
-    return Reading(snapshot, covariances, loops, known.parent.copy(), growth, known.pairs())
+    parts = known.parent.copy(), growth, known.pairs(), begins
+    return Reading(snapshot, covariances, loops, *parts)
 
 
 def _read_loops(map: Map) -> LoopEdges:
@@ -114,21 +120,31 @@ def _held(map: Map, ids: Index) -> tuple[Index, tuple[Array, Array]]:
     return np.array(holders, np.int64), compose(inverse((Ts, scales)), (Ts_held, held))
 
 
-@dataclass(frozen=True, eq=False)
-class Closure:
-    """A loop that is believed, and what the path becomes by it.
+class Tie(NamedTuple):
+    """Two keyframes that show one place.
 
     Attributes:
         keyframe_id: the keyframe that came back.
         matched_id: the keyframe it came back to.
         measured: what geometry says of the two.
-        before: the path that was read.
-        after: the path corrected.
     """
 
     keyframe_id: int
     matched_id: int
     measured: Verified
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """Loops that are believed, and what the path becomes by them.
+
+    Attributes:
+        ties: the loops, one at least.
+        before: the path that was read.
+        after: the path corrected.
+    """
+
+    ties: tuple[Tie, ...]
     before: Essentials
     after: Corrected
 
@@ -149,16 +165,10 @@ class Closure:
         map.apply(self._update(map))
         for keyframe in came:
             carry_covariance(map, keyframe)
-        self._fuse(map)
-        found = self.measured
-        map.add_edge(
-            self.matched_id,
-            self.keyframe_id,
-            found.T_matched_keyframe,
-            found.information,
-            LOOP,
-            scale_i_j=found.scale,
-        )
+        for newer, matched, found in self.ties:
+            _fuse(map, newer, matched, found)
+            T, scale = found.T_matched_keyframe, found.scale
+            map.add_edge(matched, newer, T, found.information, LOOP, scale_i_j=scale)
         return were
 
     def _update(self, map: Map) -> Update:
@@ -186,17 +196,14 @@ class Closure:
             covariances=None if after.covariances is None else after.covariances[row],
         )
 
-    def _fuse(self, map: Map) -> None:
-        """Join landmarks of both sides that are one point, and observe what either side shows."""
-        found = self.measured
-        map.fuse_landmarks(found.pairs[:, 1], found.pairs[:, 0])
-        for k, seen in (
-            (self.keyframe_id, found.seen_by_newer),
-            (self.matched_id, found.seen_by_matched),
-        ):
-            ids, taken = map.observations_of(k)
-            is_free = ~np.isin(seen[:, 0], taken) & ~np.isin(map.resolve(seen[:, 1]), ids)
-            map.add_observations(k, seen[is_free, 1], seen[is_free, 0])
+
+def _fuse(map: Map, newer: int, matched: int, found: Verified) -> None:
+    """Join landmarks of both sides that are one point, and observe what either side shows."""
+    map.fuse_landmarks(found.pairs[:, 1], found.pairs[:, 0])
+    for k, seen in ((newer, found.seen_by_newer), (matched, found.seen_by_matched)):
+        ids, taken = map.observations_of(k)
+        is_free = ~np.isin(seen[:, 0], taken) & ~np.isin(map.resolve(seen[:, 1]), ids)
+        map.add_observations(k, seen[is_free, 1], seen[is_free, 0])
 
 
 def carry_covariance(map: Map, keyframe: Acquaintance) -> None:

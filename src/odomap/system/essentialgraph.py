@@ -7,15 +7,17 @@ poses tells enough. Its edges are relative placements S_i⁻¹ S_j of
     covisibility  keyframes of two branches that share many landmarks, as they are now
     loop          as measured when it was closed, never as it is now
 
-S is of SE(3), or of Sim(3) for a single camera, which loses its scale on the way. A new loop is
-believed if odometry and the earlier loops do not contradict it: graduated non-convexity on tree and
-loops. Then all edges give the poses; marginals of tree and loops say how sure these are,
+S is of SE(3), or of Sim(3) for a single camera. A new loop is believed if odometry and the earlier
+loops do not contradict it: graduated non-convexity on tree and loops. Then all edges give the
+poses; marginals of tree and loops say how sure these are,
 
     Σ_k = (H⁻¹)_kk + Ad(T_k_root) Σ_root Ad(T_k_root)ᵀ,
 
 without the covisibility edges, which hold branches together but measured nothing new. With no loop
-that is what odometry claimed; with one it is less. Covisible keyframes of one branch have no edge,
-unlike in the paper: it would say again what the tree says, and stiffen the path against the loop.
+that is what odometry claimed. Covisible keyframes of one branch have no edge, unlike in the paper:
+it would say again what the tree says. Across gaps nothing was measured: each piece of a map
+(`maps/atlas`) is held by its oldest keyframe, until a loop to an older piece, which nothing
+contradicts, holds it instead, and so moves and scales it as a whole.
 
 Cost: a handful of sparse factorisations, O(K^1.5).
 
@@ -23,13 +25,14 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015; Strasdat, Montiel, Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.descent import SolverConfig
+from odomap.backend.graphs.components import find_components
 from odomap.backend.graphs.covariances import GraphCovariances
 from odomap.backend.graphs.gnc import find_inliers
 from odomap.backend.graphs.posegraph import Group, PoseGraph
@@ -84,7 +87,7 @@ class Essentials:
         Ts_world_body: (K, 4, 4).
         scales: (K,) world units per unit of the keyframe.
         covariances: (K, 6, 6) as the map has them, NaN where unknown.
-        parent: (K,) rows in the spanning tree, −1 for the root.
+        parent: (K,) rows in the spanning tree, −1 for the root, and where a piece begins.
         growth: (K, 6, 6) by what each is less sure than its parent, in its own units; NaN where
             unknown.
         pairs: (C, 2) rows of keyframes that share many landmarks.
@@ -104,7 +107,7 @@ class Essentials:
 
     @property
     def root(self) -> int:
-        """Row of the root, which stays where it is."""
+        """Row of the oldest root, which stays where it is."""
         return int(np.flatnonzero(self.parent < 0)[0])
 
 
@@ -141,6 +144,8 @@ class Corrected:
         is_accepted: whether the loop is believed; if not, all is as it was.
         num_rejected: earlier loops that are not believed any more.
         reason: why the new loop is not.
+        is_believed: (L,) which of the new loops are.
+        is_merging: (L,) which of the new loops tie pieces that nothing tied before.
     """
 
     Ts_world_body: Array
@@ -149,38 +154,41 @@ class Corrected:
     is_accepted: bool
     num_rejected: int = 0
     reason: str = ""
+    is_believed: Bool = field(default_factory=lambda: np.zeros(0, bool))
+    is_merging: Bool = field(default_factory=lambda: np.zeros(0, bool))
 
 
 def correct(
     parts: Essentials, new: LoopEdges, with_scale: bool, stop: Stop | None = None
 ) -> Corrected:
-    """Correct a path by a new loop.
+    """Correct a path by new loops.
 
     Args:
         parts: the map's keyframes and what ties them.
-        new: the loop, one row.
+        new: a loop, or several that are found together.
         with_scale: whether scale drifts: a single camera.
         stop: ends early, with what there is.
 
     Returns:
-        Where the keyframes are then, or why the loop is not believed.
+        Where the keyframes are then, or why none of the loops is believed.
     """
     loops = LoopEdges(*(np.concatenate(both) for both in zip(parts.loops, new)))
-    sparse = _graph(parts, loops, with_scale)
+    sparse, count = _graph(parts, loops, with_scale), len(new.i)
+    is_merging = _is_apart(sparse, count)
     inliers = find_inliers(sparse, stop=None if stop is None else stop.is_set)
     is_true = inliers.is_inlier | ~sparse.is_doubted
-    num_rejected = int((~is_true[:-1]).sum())
-    if not is_true[-1]:
-        reason = _contradiction(sparse)
-        none = parts.Ts_world_body, parts.scales, None
-        return Corrected(*none, is_accepted=False, num_rejected=num_rejected, reason=reason)
+    num_rejected, is_believed = int((~is_true[:-count]).sum()), is_true[-count:]
+    told = num_rejected, "", is_believed, is_merging
+    if not is_believed.any():
+        told = num_rejected, _contradiction(sparse), is_believed, is_merging
+        return Corrected(parts.Ts_world_body, parts.scales, None, False, *told)
     whole = _with_covisibility(sparse.placed(inliers.Ts_world_node), parts)
     weights = np.concatenate([is_true, np.ones(whole.num_edges - len(is_true))])
     config = SolverConfig(iterations=ITERATIONS)
     solution = solve(whole, initial="given", weights=weights, config=config, stop=stop)
     Ts, scales = _rigid(solution.Ts_world_node, with_scale)
     believed = sparse.without(~is_true).placed(solution.Ts_world_node)
-    return Corrected(Ts, scales, _covariances(parts, believed, Ts, scales), True, num_rejected)
+    return Corrected(Ts, scales, _covariances(parts, believed, Ts, scales), True, *told)
 
 
 # ---- the graph ----
@@ -303,6 +311,14 @@ def _between(Ts: Array, i: Index, j: Index, with_scale: bool) -> Array:
     return np.asarray(inverse(Ts[i]) @ Ts[j])
 
 
+def _is_apart(graph: EssentialGraph, count: int) -> Bool:
+    """Say which of the last `count` loops tie parts that nothing else ties."""
+    label = find_components(
+        graph.without(np.arange(graph.num_edges) >= graph.num_edges - count)
+    ).label
+    return np.asarray((label[graph.first] != label[graph.second])[-count:])
+
+
 # ---- what comes of it ----
 
 
@@ -329,8 +345,9 @@ def _covariances(
     units = np.ones((len(Ts), 6))
     units[:, :3] = scales[:, None]
     found = GraphCovariances(graph).marginals()[:, :6, :6] * units[:, :, None] * units[:, None, :]
-    known = parts.covariances[parts.root]
-    if np.isfinite(known).all():
-        Ad = se3_adjoint(se3_inverse(Ts) @ Ts[parts.root])
-        found = found + Ad @ known @ np.swapaxes(Ad, 1, 2)
+    parted = find_components(graph)
+    roots = parted.anchor[parted.label]  # each held by the oldest of its piece, as sure as that is
+    known = np.where(np.isfinite(parts.covariances[roots]), parts.covariances[roots], 0.0)
+    Ad = se3_adjoint(se3_inverse(Ts) @ Ts[roots])
+    found = found + Ad @ known @ np.swapaxes(Ad, 1, 2)
     return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))

@@ -42,6 +42,8 @@ class Loop:
         num_inliers: matches that agree with it.
         is_accepted: whether the map was corrected with it.
         reason: why not; empty when it was.
+        merges: whether it makes one of two pieces of the map (`maps/atlas`), the newer of which
+            was moved as a whole.
     """
 
     keyframe_id: int
@@ -50,6 +52,7 @@ class Loop:
     num_inliers: int
     is_accepted: bool
     reason: str = ""
+    merges: bool = False
 
 
 @dataclass(frozen=True)

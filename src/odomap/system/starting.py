@@ -6,6 +6,9 @@ Both views are then adjusted together and become keyframes. The scale is free, a
 median depth is 1 at the start, and what it was when tracking starts anew. From then on it lives in
 the landmarks. The views between the two are placed when there are landmarks to place them with.
 
+A start after a long loss begins a piece of the map (`maps/atlas`): its first keyframe hangs from
+the one it was lost at by a gap, until a place seen before says where it is.
+
 Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces", ISMAR 2007.
 """
 
@@ -98,8 +101,11 @@ class OneViewStart:
 
     anew = "started anew where it was last: how it moved since is not known"
 
-    def __init__(self, keyframes: Keyframes, association: Association, config: Config) -> None:
-        self._keyframes, self._association, self._config = keyframes, association, config
+    def __init__(
+        self, map: Map, keyframes: Keyframes, association: Association, config: Config
+    ) -> None:
+        self._map, self._keyframes = map, keyframes
+        self._association, self._config = association, config
         self._is_checked = False
 
     def begin(
@@ -124,6 +130,7 @@ class OneViewStart:
             return Waiting(f"{count} points with depth of {needed} needed to start: {why}")
         self._is_checked = True
         made = self._keyframes.add(view, T_world_body, seen, -1, covariance)
+        self._map.begin_piece(made.keyframe_id)
         placed = Placed(frame.stamp_ns, made.keyframe_id, np.eye(4), np.zeros((6, 6)))
         return Started(made, (placed,), count)
 
@@ -308,7 +315,9 @@ class TwoViewsStart:
         points_world = points @ T_world_body[:3, :3].T + T_world_body[:3, 3]
         pixels = corners.corners[corners.found]
         seen = self._keyframes.seen_first(corners.first, pixels, points_world)
-        return self._keyframes.add(corners.first, T_world_body, seen, -1, covariance)
+        made = self._keyframes.add(corners.first, T_world_body, seen, -1, covariance)
+        self._map.begin_piece(made.keyframe_id)
+        return made
 
     def _placed_between(
         self, keyframe_id: int, corners: FollowedCorners, points: Array, T_first_second: Array
@@ -344,5 +353,5 @@ def make_start(
 ) -> Start:
     """Return the start for what an eye sees: one view where depth is measured, else two."""
     if keyframes.ranger is not None:
-        return OneViewStart(keyframes, association, config)
+        return OneViewStart(map, keyframes, association, config)
     return TwoViewsStart(map, eye, keyframes, association, config)
