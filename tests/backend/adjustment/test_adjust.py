@@ -429,3 +429,41 @@ def test_a_stop_ends_a_gated_adjustment_too():
     assert not solution.converged
     assert solution.iterations == 1
     assert np.isfinite(solution.points_world).all()
+
+
+def test_measured_depths_say_how_large_the_world_is():
+    problem, Ts, X, _ = world("pinhole", views=6, points=80, sigma_px=0.3, seed=3)
+    depths = np.einsum("nj,nj->n", Ts[problem.view, 2, :3], X[problem.point])
+    depths += Ts[problem.view, 2, 3]
+    rng = np.random.default_rng(3)
+    measured = 1.0 / depths + rng.normal(0.0, 1e-3, len(depths))
+    measured[rng.random(len(depths)) < 0.3] = np.nan
+    grown = Ts.copy()
+    grown[:, :3, 3] *= 1.1
+    fixed = np.arange(6) == 0
+    grown[0] = Ts[0]
+    start = replace(
+        problem,
+        Ts_camera_world=grown,
+        is_fixed_view=fixed,
+        inverse_depths=measured,
+        depth_weights=1e3,
+    )
+    hold = AdjustmentConfig(gauge="hold")
+    found = adjust(start, hold)
+    assert found.converged
+    assert 0.8 < found.variance_factor < 1.2
+    assert np.abs(found.Ts_camera_world - Ts).max() < 0.02
+    nothing = replace(start, inverse_depths=None, depth_weights=None)
+    unknown = adjust(nothing, hold)
+    assert np.abs(unknown.Ts_camera_world - Ts).max() > 0.1  # without depth the size stays
+
+
+def test_depths_that_cannot_be_are_refused():
+    problem, *_ = world("pinhole")
+    with pytest.raises(InputError, match="inverse_depths: one is infinite"):
+        replace(problem, inverse_depths=np.inf)
+    with pytest.raises(InputError, match="depth_weights: a standard deviation"):
+        replace(problem, inverse_depths=0.1, depth_weights=-1.0)
+    with pytest.raises(InputError, match="inverse_depths: has shape"):
+        replace(problem, inverse_depths=np.zeros(3))

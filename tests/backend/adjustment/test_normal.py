@@ -43,10 +43,22 @@ def cost_at(descent, delta, points):
     return descent.evaluate(moved(descent, delta, points))[0]
 
 
+def with_depth(problem, seed=0):
+    """Return a problem in which the depths of most observations were measured as well."""
+    rng = np.random.default_rng(seed)
+    Ts = problem.Ts_camera_world[problem.view]
+    X = np.einsum("nij,nj->ni", Ts[:, :3, :3], problem.points_world[problem.point]) + Ts[:, :3, 3]
+    inverse = 1.0 / X[:, 2] + rng.normal(0.0, 0.01, len(X))
+    inverse[rng.random(len(X)) < 0.3] = np.nan
+    return replace(problem, inverse_depths=inverse, depth_weights=rng.uniform(50, 200, len(X)))
+
+
+@pytest.mark.parametrize("deep", [False, True])
 @pytest.mark.parametrize("lens", FREE)
 @pytest.mark.parametrize("name", LENSES)
-def test_the_gradient_is_that_of_differences(name, lens):
+def test_the_gradient_is_that_of_differences(name, lens, deep):
     problem, *_ = world(name, views=4, points=20, **FREE[lens])
+    problem = with_depth(problem) if deep else problem
     descent = descent_of(problem, Loss("cauchy", 3.0))
     system = descent.linearise(0.1)
     n, still = len(system.a), np.zeros_like(descent.state.points)
@@ -77,6 +89,7 @@ def dense_system(descent, damping):
             X, theta = views.R[k] @ places[m] + views.t[k], lenses.theta[views.lens[k]]
             plane = X[:2] / X[2]
             rows.append(seen.weight[o] * (theta[:2] * plane + theta[2:4] - seen.pixels[o]))
+            rows.append(seen.depth_weight[o : o + 1] * (1 / X[2] - seen.inverse_depth[o]))
         return np.concatenate(rows)
 
     def column(delta, step, h):
@@ -94,9 +107,11 @@ def dense_system(descent, damping):
     return H - W @ np.linalg.solve(C, W.T), J[0].T @ r - W @ np.linalg.solve(C, J[1].T @ r)
 
 
+@pytest.mark.parametrize("deep", [False, True])
 @pytest.mark.parametrize("lens", FREE)
-def test_the_reduced_matrix_is_the_schur_complement(lens):
+def test_the_reduced_matrix_is_the_schur_complement(lens, deep):
     problem, *_ = world("pinhole", views=4, points=12, **FREE[lens])
+    problem = with_depth(problem) if deep else problem
     fixed = np.array([True, False, False, False])
     problem = replace(problem, is_fixed_view=fixed & (lens != "own"))
     descent, damping = descent_of(problem), 0.01

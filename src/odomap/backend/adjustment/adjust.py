@@ -270,7 +270,7 @@ def _solve(
     progress: Callable[[IterationRecord], None] | None,
 ) -> AdjustmentSolution:
     """Solve without the outliers."""
-    used = _without(problem, is_outlier) if is_outlier.any() else problem
+    used = problem.some(~is_outlier) if is_outlier.any() else problem
     gauge = find_gauge(used)
     layout = lay_out(used)
     _check_surplus(used, layout, gauge)
@@ -304,18 +304,6 @@ def _solve(
     )
 
 
-def _without(problem: Adjustment, is_outlier: Mask) -> Adjustment:
-    """Return the problem without some of its observations."""
-    kept = ~is_outlier
-    return replace(
-        problem,
-        view=problem.view[kept],
-        point=problem.point[kept],
-        pixels=problem.pixels[kept],
-        weights=problem.weights[kept],
-    )
-
-
 def _check_surplus(problem: Adjustment, layout: Layout, gauge: Gauge) -> None:
     """Refuse a problem with fewer numbers seen than are unknown."""
     free = int(np.count_nonzero(~layout.blocks.is_held))
@@ -323,6 +311,7 @@ def _check_surplus(problem: Adjustment, layout: Layout, gauge: Gauge) -> None:
     if unknown == 0:
         raise _UnsolvableError("adjust: every view, point and lens that is seen is held: free some")
     rows = 2 * int(np.count_nonzero(problem.weights > 0.0))
+    rows += int(np.count_nonzero(problem.has_depth))
     if rows - unknown + int(np.count_nonzero(gauge.is_held)) < 0:
         raise _UnsolvableError(
             f"adjust: {rows} numbers were seen, {unknown} are unknown: hold views, points or lenses"
@@ -334,12 +323,14 @@ def _variance_factor(problem: Adjustment, chi2: Array) -> float:
     is_lost = ~np.isfinite(chi2) | (problem.weights == 0.0)
     if is_lost.all():
         return 1.0
-    counted = _without(problem, is_lost)
+    counted = problem.some(~is_lost)
     # A point seen once has three unknowns, of which two numbers tell two.
-    told = np.minimum(3, 2 * np.bincount(counted.point, minlength=counted.num_points))
+    deep = counted.point[counted.has_depth]
+    seen = 2 * np.bincount(counted.point, minlength=counted.num_points)
+    told = np.minimum(3, seen + np.bincount(deep, minlength=counted.num_points))
     unknown = int(told[~counted.is_fixed_point].sum())
     unknown += int(np.count_nonzero(~lay_out(counted).blocks.is_held))
-    surplus = 2 * counted.num_observations - unknown
+    surplus = 2 * counted.num_observations + len(deep) - unknown
     surplus += int(np.count_nonzero(find_gauge(counted).is_held))
     return float(chi2[~is_lost].sum() / surplus) if surplus > 0 else 1.0
 

@@ -5,7 +5,8 @@ unknowns in which the cost is level. A damped solver is best left free in them; 
 connected part of the problem that could move is brought back,
 
     the first view to where it was, and with it six of the seven (a fixed view is there already)
-    the farthest view to the distance it had, if the fixed views are all at one place,
+    the farthest view to the distance it had, if the fixed views are all at one place and no depth
+    was measured,
 
 by p ← T_wa s T_aw' p, where T_aw' is the first view as found and T_wa as given. To ask how sure a
 solution is, six coordinates of the first view and one of the farthest are held instead: of its
@@ -67,6 +68,8 @@ def find_gauge(problem: Adjustment) -> Gauge:
     names, part[touched] = np.unique(label[touched], return_inverse=True)
     has_fixed_point = np.zeros(len(names), np.bool_)
     has_fixed_point[part[k:][problem.is_fixed_point & (part[k:] >= 0)]] = True
+    has_depth = np.zeros(len(names), np.bool_)
+    has_depth[part[problem.view[problem.has_depth]]] = True
     anchor, far = np.full((2, len(names)), -1)
     is_held = np.zeros((k, 6), np.bool_)
     Ts_world_camera = se3_inverse(problem.Ts_camera_world)
@@ -78,7 +81,7 @@ def find_gauge(problem: Adjustment) -> Gauge:
         way = Ts_world_camera[views, :3, 3] - Ts_world_camera[anchor[c], :3, 3]
         length = np.linalg.norm(way, axis=1)
         spread = length[problem.is_fixed_view[views]].max(initial=0.0)
-        if length.max() > 0.0 and spread <= NEAR * length.max():
+        if length.max() > 0.0 and spread <= NEAR * length.max() and not has_depth[c]:
             far[c] = views[np.argmax(length)]
             R = Ts_world_camera[far[c], :3, :3]
             is_held[far[c], np.argmax(np.abs(way[np.argmax(length)] @ R))] = True

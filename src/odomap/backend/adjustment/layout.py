@@ -52,8 +52,8 @@ class Blocks(NamedTuple):
 class Seen(NamedTuple):
     """Observations sorted by point: those of point m are start[m] to start[m + 1].
 
-    of_view (N,), pixels (N, 2), weight (N,), and the incidences of the pose and of the lens, -1 for
-    none.
+    of_view (N,), pixels (N, 2), weight (N,), the incidences of the pose and of the lens, -1 for
+    none, inverse_depth (N,) and depth_weight (N,), zero where depth was not measured.
     """
 
     start: Index
@@ -62,6 +62,8 @@ class Seen(NamedTuple):
     weight: Array
     pose: Index
     lens: Index
+    inverse_depth: Array
+    depth_weight: Array
 
 
 class Incidences(NamedTuple):
@@ -114,7 +116,8 @@ def lay_out(problem: Adjustment, is_held_view: Mask | None = None) -> Layout:
     order = by_view[by_point]
     view = problem.view[order]
     is_free_point = ~problem.is_fixed_point[point_order] & (np.diff(start) > 0)
-    seen = Seen(start, view, problem.pixels[order], problem.weights[order], *_no_indices(n, n))
+    pixels, weights, (pose, lens) = problem.pixels[order], problem.weights[order], _no_indices(n, n)
+    seen = Seen(start, view, pixels, weights, pose, lens, *_depths(problem, order))
     touched, point = _no_indices(2 * n, 2 * n)
     first = np.zeros(m + 1, np.int64)
     marks = np.full((2, len(blocks.size)), -1)
@@ -124,6 +127,15 @@ def lay_out(problem: Adjustment, is_held_view: Mask | None = None) -> Layout:
     slabs = _starts(3 * blocks.size[touched])
     incidences = Incidences(first, touched, point, slabs, by_block, block_start)
     return Layout(order, point_order, seen, blocks, incidences, is_free_point, is_joined)
+
+
+def _depths(problem: Adjustment, order: Index) -> tuple[Array, Array]:
+    """Return measured inverse depths (N,) and their weights, zero where there is none."""
+    if problem.inverse_depths is None or problem.depth_weights is None:
+        return np.zeros(len(order)), np.zeros(len(order))
+    has_depth = problem.has_depth[order]
+    depths, deep = problem.inverse_depths[order], problem.depth_weights[order]
+    return np.where(has_depth, depths, 0.0), np.where(has_depth, deep, 0.0)
 
 
 def _by_first_view(problem: Adjustment) -> tuple[Index, Index]:

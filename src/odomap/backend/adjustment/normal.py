@@ -5,8 +5,9 @@ in camera axes and its pixel u change as
 
     ∂X/∂ξ = [-I | [X]ₓ],   ∂X/∂p = R_cw,   ∂u/∂(ξ, θ, p) = (G ∂X/∂ξ, H, G R_cw),
 
-G and H from `lenses`. Point m with C = Σ PᵀP, c = Σ Pᵀr and W = Σ JᵀP at each block it
-touches is damped and factored, (1 + λ) diag C added to C = L Lᵀ, and leaves
+G and H from `lenses`; where depth was measured, 1/X_z changes by -∂X_z/X_z². Point m with
+C = Σ PᵀP, c = Σ Pᵀr and W = Σ JᵀP at each block it touches is damped and factored, (1 + λ) diag C
+added to C = L Lᵀ, and leaves
 
     V = W L⁻ᵀ,   y = L⁻¹ c :     S = A - V Vᵀ,   s = a - V y,   δp = -L⁻ᵀ (y + Vᵀ δ).
 
@@ -136,6 +137,50 @@ def _add_point(J: Array, u0: float, u1: float, C: Array, c: Array, m: int) -> No
 
 
 @kernel(reorder=True)
+def _add_depth(
+    R: Array,
+    i: int,
+    X: tuple[float, float, float],
+    r: float,
+    slope: float,
+    touches: tuple[int, int, int, int],
+    scale: Array,
+    A: Array,
+    a: Array,
+    V: Array,
+    C: Array,
+    c: Array,
+    m: int,
+    J: Array,
+) -> None:
+    """Add residual r of a measured depth, of the given slope by X_z, to all that `linearise` fills.
+
+    touches: rows of the view's block and where it begins in a, in A and, its slab, in V; -1: none.
+    J: room for (2, 9).
+    """
+    n, row, at, slab = touches
+    J[0, 0], J[0, 1], J[0, 2] = 0.0, 0.0, -slope
+    J[0, 3], J[0, 4], J[0, 5] = -slope * X[1], slope * X[0], 0.0
+    for j in range(3):
+        J[0, 6 + j] = slope * R[i, 2, j]
+    if row >= 0:
+        for j in range(6):
+            J[0, j] *= scale[row + j]
+            a[row + j] += J[0, j] * r
+            for k in range(j + 1):
+                A[at + j * n + k] += J[0, j] * J[0, k]
+            if slab >= 0:
+                for k in range(3):
+                    V[slab + k * n + j] += J[0, j] * J[0, 6 + k]
+    e = 0
+    for j in range(3):
+        c[m, j] += J[0, 6 + j] * r
+        for k in range(j + 1):
+            C[e] += J[0, 6 + j] * J[0, 6 + k]
+            e += 1
+
+
+@kernel(reorder=True)
 def cholesky_3(C: Array, damping: float) -> tuple[float, float, float, float, float, float]:
     """C + λ diag C = L Lᵀ of a packed C (6,): l₁₀ l₂₀ l₂₁ and the inverse pivots.
 
@@ -199,7 +244,7 @@ def linearise(
     # Fields are taken out of their tuples once: each access counts references, atomically.
     R, t, lens = views
     theta, kind, used, reach = lenses
-    start, of_view, pixels, weight, pose_touch, lens_touch = seen
+    start, of_view, pixels, weight, pose_touch, lens_touch, inverse_depth, deep = seen
     pose_block, lens_block, _, size, row, block_at, _ = blocks
     first, touched, _, slab_at, _, _ = incidences
     scale, A, coupling, a, V, L, y, c, d = system
@@ -223,7 +268,8 @@ def linearise(
             if not project(kind[q], theta, q, reach[q], X, Y, Z, True, D):
                 continue
             u0, u1 = weight[o] * (D[0, 0] - pixels[o, 0]), weight[o] * (D[1, 0] - pixels[o, 1])
-            root = np.sqrt(loss_weight(loss[0], loss[1], u0 * u0 + u1 * u1))
+            u2 = deep[o] * (1.0 / Z - inverse_depth[o]) if deep[o] > 0.0 else 0.0
+            root = np.sqrt(loss_weight(loss[0], loss[1], u0 * u0 + u1 * u1 + u2 * u2))
             u0, u1 = root * u0, root * u1
             _weigh(R, i, X, Y, Z, weight[o] * root, D, J)
             if b >= 0:
@@ -241,6 +287,13 @@ def linearise(
                         for k in range(n):
                             coupling[i, j, k] += J[0, j] * J[0, 6 + k] + J[1, j] * J[1, 6 + k]
             _add_point(J, u0, u1, C, c, m)
+            if deep[o] > 0.0:
+                slope, slab = -root * deep[o] / (Z * Z), -1
+                if pose_touch[o] >= 0:
+                    slab = slab_at[pose_touch[o]]
+                touches = (size[b], row[b], block_at[b], slab) if b >= 0 else (0, -1, -1, -1)
+                at = X, Y, Z
+                _add_depth(R, i, at, root * u2, slope, touches, scale, A, a, V, C, c, m, J)
         if is_free_point[m]:
             _factor_point(C, c, m, damping, L, y, d)
             for j in range(first[m], first[m + 1]):
@@ -264,7 +317,7 @@ def robust_cost(
     """
     R, t, lens = views
     theta, kind, _, reach = lenses
-    start, of_view, pixels, weight, _, _ = seen
+    start, of_view, pixels, weight, _, _, inverse_depth, deep = seen
     D = np.empty((2, 16))
     total, lost = 0.0, 0
     for m in range(len(points)):
@@ -280,6 +333,8 @@ def robust_cost(
             if project(kind[q], theta, q, reach[q], X, Y, Z, False, D):
                 u0, u1 = D[0, 0] - pixels[o, 0], D[1, 0] - pixels[o, 1]
                 chi2[o] = (u0 * u0 + u1 * u1) * weight[o] * weight[o]
+                if deep[o] > 0.0:
+                    chi2[o] += (deep[o] * (1.0 / Z - inverse_depth[o])) ** 2
                 cost += 0.5 * loss_cost(loss[0], loss[1], chi2[o])
             else:
                 away += 1

@@ -120,6 +120,17 @@ def _add_ray(
             at += 1
 
 
+@kernel(reorder=True)
+def _add_depth(R: Array, i: int, slope: float, u2: float, w: float, C: Array, c: Array) -> None:
+    """The same of a measured depth: P = slope (R_cw)₂, the slope by the third of camera axes."""
+    at = 0
+    for j in range(3):
+        c[j] += slope * R[i, 2, j] * u2
+        for k in range(j + 1):
+            C[at] += w * slope * slope * R[i, 2, j] * R[i, 2, k]
+            at += 1
+
+
 @kernel
 def _own_step(C: Array, c: Array, damping: float) -> tuple[float, float, float]:
     """-(C + λ diag C)⁻¹ c."""
@@ -153,7 +164,7 @@ def refine_points(
     """
     R, t, lens = views
     theta, kind, _, reach = lenses
-    start, of_view, pixels, weight, _, _ = seen
+    start, of_view, pixels, weight, _, _, inverse_depth, deep = seen
     D, C, c = np.zeros((2, 16)), np.empty(6), np.empty(3)
     total, lost = 0.0, 0
     for m in range(len(points)):
@@ -182,11 +193,14 @@ def refine_points(
                     continue
                 u0 = weight[o] * (D[0, 0] - pixels[o, 0])
                 u1 = weight[o] * (D[1, 0] - pixels[o, 1])
-                s = u0 * u0 + u1 * u1
+                u2 = deep[o] * (1.0 / Z - inverse_depth[o]) if deep[o] > 0.0 else 0.0
+                s = u0 * u0 + u1 * u1 + u2 * u2
                 cost += 0.5 * loss_cost(loss[0], loss[1], s)
                 if attempt < 2:
                     w = loss_weight(loss[0], loss[1], s)
                     _add_ray(R, i, D, weight[o], w * u0, w * u1, w, C, c)
+                    if deep[o] > 0.0:
+                        _add_depth(R, i, -deep[o] / (Z * Z), w * u2, w, C, c)
             if cost + charge * away < least:
                 p, least, unseen = x, cost + charge * away, away
                 if attempt < 2:

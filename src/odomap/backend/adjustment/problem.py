@@ -5,8 +5,9 @@ it appeared at pixel u, of standard deviation 1/w. The best views, points and le
 
     ½ Σ_o ρ( ‖ w_o ( π(θ_l, T_cw p) - u_o ) ‖² ),
 
-with some views, points or numbers θ of the lenses held fixed. The lens models π are those of
-`geometry.camera`, and that of the BAL data sets, whose camera looks along -z:
+with some views, points or numbers θ of the lenses held fixed. Where depth was measured too, its
+inverse δ with weight v, a residual has a third part, v (1 / P_z - δ). The lens models π are those
+of `geometry.camera`, and that of the BAL data sets, whose camera looks along -z:
 
     P = T_cw p,   q = -(P_x, P_y) / P_z,   π = f (1 + k₁|q|² + k₂|q|⁴) q.
 
@@ -16,7 +17,7 @@ Reference: S. Agarwal, N. Snavely, S. Seitz, R. Szeliski, "Bundle adjustment in 
 ECCV 2010 (BAL).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -61,6 +62,10 @@ class Adjustment:
         is_fixed_point: (M,) bool, or one for all; points to hold. Default none.
         is_free_intrinsic: (L, P) bool, (L, 1), (P,) or one for all: numbers of the lenses to
             adjust. Default none.
+        inverse_depths: (N,) measured inverse depths along the views' axes, 1/m; NaN for one that
+            was not measured. Default none.
+        depth_weights: (N,) inverse standard deviations of these, m, or one for all. Default 1 with
+            inverse depths, else none.
 
     Raises:
         InputError: shapes, indices, numbers that are not finite, an unknown model.
@@ -86,6 +91,8 @@ class Adjustment:
     is_fixed_view: Mask = False  # type: ignore[assignment]
     is_fixed_point: Mask = False  # type: ignore[assignment]
     is_free_intrinsic: Mask = False  # type: ignore[assignment]
+    inverse_depths: Array | None = None
+    depth_weights: Array | None = None
 
     def __post_init__(self) -> None:
         Ts = self._set("Ts_camera_world", _reals(self.Ts_camera_world, (4, 4), "Ts_camera_world"))
@@ -100,6 +107,11 @@ class Adjustment:
         self._set("point", _indices(self.point, (n, m), "point"))
         self._set("lens", _indices(self._default_lens(k), (k, len(intrinsics)), "lens"))
         self._set("weights", _spread(np.asarray(self.weights, np.float64), (n,), "weights"))
+        if self.inverse_depths is not None:
+            deep = 1.0 if self.depth_weights is None else self.depth_weights
+            depths = np.asarray(self.inverse_depths, np.float64)
+            self._set("inverse_depths", _broadcast(depths, (n,), "inverse_depths"))
+            self._set("depth_weights", _spread(np.asarray(deep), (n,), "depth_weights"))
         for name, shape in (
             ("is_fixed_view", (k,)),
             ("is_fixed_point", (m,)),
@@ -122,6 +134,26 @@ class Adjustment:
     def num_observations(self) -> int:
         """N."""
         return len(self.pixels)
+
+    @property
+    def has_depth(self) -> Mask:
+        """(N,) whether the depth of an observation was measured, and counts."""
+        if self.inverse_depths is None or self.depth_weights is None:
+            return np.zeros(self.num_observations, np.bool_)
+        return np.asarray(~np.isnan(self.inverse_depths) & (self.depth_weights > 0.0))
+
+    def some(self, rows: Mask) -> "Adjustment":
+        """Return the problem with some of its observations, rows (N,)."""
+        depths, deep = self.inverse_depths, self.depth_weights
+        return replace(
+            self,
+            view=self.view[rows],
+            point=self.point[rows],
+            pixels=self.pixels[rows],
+            weights=self.weights[rows],
+            inverse_depths=None if depths is None else depths[rows],
+            depth_weights=None if deep is None else deep[rows],
+        )
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -154,8 +186,13 @@ class Adjustment:
         if below.max() > _BELOW:
             bad = int(np.argmax(below))
             raise InputError(f"adjustment: Ts_camera_world[{bad}]: its last row is not 0 0 0 1")
-        if self.weights.min() < 0:
-            raise InputError("adjustment: weights: a standard deviation is not negative")
+        for name, weights in (("weights", self.weights), ("depth_weights", self.depth_weights)):
+            if weights is not None and weights.min() < 0:
+                raise InputError(f"adjustment: {name}: a standard deviation is not negative")
+        if self.inverse_depths is not None and np.isinf(self.inverse_depths).any():
+            raise InputError(
+                "adjustment: inverse_depths: one is infinite; one that is not known is NaN"
+            )
         if len(self.models) != len(self.intrinsics):
             raise InputError(
                 f"adjustment: model: {len(self.models)} names for {len(self.intrinsics)} lenses"
@@ -233,6 +270,12 @@ def _spread(values: NDArray[np.generic], shape: tuple[int, ...], name: str) -> N
     """Return a fresh array of that shape, what was given repeated."""
     if values.dtype == np.float64 and not np.isfinite(values).all():
         raise InputError(f"adjustment: {name} holds a value that is not finite")
+    return _broadcast(values, shape, name)
+
+
+def _broadcast(
+    values: NDArray[np.generic], shape: tuple[int, ...], name: str
+) -> NDArray[np.generic]:
     try:
         return np.array(np.broadcast_to(values, shape), order="C")
     except ValueError:
