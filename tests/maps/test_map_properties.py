@@ -197,7 +197,7 @@ class MapMachine(RuleBasedStateMachine):
         known = [*self.model.S, *self.model.holder]
         parent = self.some(rng, known, 1)[0] if known and rng.random() < 0.7 else -1
         T, k = random_pose(rng), self.map.new_keyframe_id()
-        scale = float(np.exp(rng.normal())) if rng.random() < 0.3 else None
+        scale = float(np.exp(rng.normal())) if rng.random() < 0.3 else 1.0
         newest = [j for j in self.model.order if j in self.model.S][-1:] or [-1]
         self.map.add_keyframe(Keyframe(k, 10 * k), T, parent=parent, scale=scale)
         if parent < 0 and known:
@@ -207,8 +207,7 @@ class MapMachine(RuleBasedStateMachine):
                 assert parent == newest[0]
         self.model.parent[k] = parent
         self.model.order.append(k)
-        inherited = 1.0 if parent < 0 else scale_of(self.model.S[self.map.parent(k)])
-        self.model.S[k] = similarity(T, inherited if scale is None else scale)
+        self.model.S[k] = similarity(T, scale)
         self.changed()
 
     @rule(seed=SEEDS)

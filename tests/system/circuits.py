@@ -86,7 +86,7 @@ class Circuit:
             step = step @ se3_exp(self.rng.normal(size=6) * self.step_sigma)
             Ad = se3_adjoint(se3_inverse(step))
             S = Ad @ m.covariance(n - 1) @ Ad.T + np.diag(np.maximum(self.step_sigma, 1e-4) ** 2)
-            m.add_keyframe(keyframe, m.place(n - 1, step), covariance=S)
+            m.add_keyframe(keyframe, m.place(n - 1, step), covariance=S, scale=m.scale(n - 1))
         new = [p for p in seen.tolist() if n - self.known.get(p, (0, -99))[1] > MEMORY]
         local = self._local(n, new) * self.units[n]
         for p, k in zip(new, m.add_landmarks(n, local, self.walls.descriptors[new]).tolist()):

@@ -46,7 +46,7 @@ class Estimate:
         status: how it was placed; when lost, the poses hold the last one known.
         reason: a sentence a person can act on; empty when there is nothing to say.
         keyframe_id: the keyframe the pose hangs from, -1 before there is one.
-        T_keyframe_body: pose relative to that keyframe.
+        T_keyframe_body: pose relative to that keyframe, in its units.
         T_world_body: pose in the world as known when the frame was tracked.
         covariance: (6, 6) of T_world_body, tangent (translation, rotation), right update,
             metres and radians; relative to the first pose, which is exact.

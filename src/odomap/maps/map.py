@@ -1,10 +1,14 @@
 """The map: keyframes, where they are, the landmarks they see, and one lock around it all.
 
 The law is that everything hangs from keyframes: frames, landmarks and stubs are stored relative to
-one, in its units, so that correcting a path is one write of `states`. Several threads share a map;
-each method takes the lock for as long as it copies or writes arrays, never while something is
-solved. `version` grows with every change, `epoch` with every solution written (poses a caller
-remembers from an earlier epoch are stale then: place them anew from their keyframe).
+one, in its units, so that correcting a path is one write of `states`. These units are the world's
+when a keyframe is made, and others once a loop has corrected the scale. What is asked and solved is
+in the world's units, also every covariance; what hangs is not: frames come and go by `relative` and
+`place`, landmarks by `add_landmarks` and `points_world`.
+
+Several threads share a map; each method takes the lock for as long as it copies or writes arrays,
+never while something is solved. `version` grows with every change, `epoch` with every solution
+written (poses a caller remembers from an earlier epoch are stale: place them from their keyframe).
 
     snapshot(ids) → solve without the lock → apply(update)
 

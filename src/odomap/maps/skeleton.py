@@ -16,9 +16,10 @@ import threading
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from odomap.geometry.lie import se3_inverse
 from odomap.maps.edges import GAP, Edges, EdgeTable
 from odomap.maps.keyframes import Keyframe
-from odomap.maps.states import States, compose, inverse
+from odomap.maps.states import Placement, States, compose, inverse
 from odomap.maps.tree import ABSENT, ALIVE, STUB, Tree
 
 __all__ = ["Skeleton"]
@@ -65,7 +66,7 @@ class Skeleton:
         parent: int = -1,
         covariance: NDArray[np.float64] | None = None,
         v_world_body: NDArray[np.float64] | None = None,
-        scale: float | None = None,
+        scale: float = 1.0,
     ) -> None:
         """Add a keyframe.
 
@@ -75,7 +76,7 @@ class Skeleton:
             parent: id of the keyframe it was placed against; by default the newest one.
             covariance: (6, 6) of T_world_body, right tangent; unknown (NaN) by default.
             v_world_body: (3,) velocity, m/s; unknown (NaN) by default.
-            scale: world units per unit of the keyframe; by default those of its parent.
+            scale: world units per unit of the keyframe; what is new is in the world's.
         """
         with self.lock:
             k = keyframe.id
@@ -90,8 +91,7 @@ class Skeleton:
             self._tree.add(k, holder, self.version)
             self.states.extend(k + 1)
             self.states.Ts_world_body[k] = T_world_body
-            inherited = 1.0 if holder < 0 else self.states.scales[holder]
-            self.states.scales[k] = inherited if scale is None else scale
+            self.states.scales[k] = scale
             self.states.v_world_body[k] = np.nan if v_world_body is None else v_world_body
             self.states.covariances[k] = np.nan if covariance is None else covariance
             self._keyframes[k] = keyframe
@@ -138,7 +138,7 @@ class Skeleton:
     def scale(self, keyframe_id: int) -> float:
         """Return the world units per unit of a keyframe, also of a culled one."""
         with self.lock:
-            return float(self._tree.placements(self.states, self._all_known([keyframe_id]))[1][0])
+            return float(self._placement(keyframe_id)[1])
 
     def place(self, keyframe_id: int, T_keyframe_body: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of a frame that hangs from a keyframe, also from a culled one.
@@ -150,9 +150,23 @@ class Skeleton:
         Returns:
             T_world_body, of the same shape.
         """
-        with self.lock:
-            Ts, scales = self._tree.placements(self.states, self._all_known([keyframe_id]))
-        return compose((Ts[0], scales[0]), (np.asarray(T_keyframe_body), np.ones(())))[0]
+        placement = self._placement(keyframe_id)
+        return compose(placement, (np.asarray(T_keyframe_body), np.ones(())))[0]
+
+    def relative(self, keyframe_id: int, T_world_body: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how a frame hangs from a keyframe, also from a culled one: the inverse of `place`.
+
+        Args:
+            keyframe_id: the keyframe.
+            T_world_body: (4, 4) or (n, 4, 4) where the frame is.
+
+        Returns:
+            T_keyframe_body, of the same shape, in the keyframe's units.
+        """
+        T_world_keyframe, scale = self._placement(keyframe_id)
+        T = np.asarray(se3_inverse(T_world_keyframe) @ T_world_body)
+        T[..., :3, 3] /= scale
+        return T
 
     def covariance(self, keyframe_id: int) -> NDArray[np.float64]:
         """Return the (6, 6) covariance of a keyframe's pose, right tangent; NaN where unknown."""
@@ -215,6 +229,12 @@ class Skeleton:
         with self.lock:
             twin = self._edges.twin()
         return twin.table()
+
+    def _placement(self, keyframe_id: int) -> Placement:
+        """Return the (4, 4) pose and the scale of a keyframe, also of a culled one."""
+        with self.lock:
+            Ts, scales = self._tree.placements(self.states, self._all_known([keyframe_id]))
+        return Ts[0], scales[0]
 
     @staticmethod
     def _ids(ids: ArrayLike) -> NDArray[np.int64]:

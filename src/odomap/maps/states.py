@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
 
-__all__ = ["States", "act", "act_inverse", "compose", "inverse"]
+__all__ = ["States", "act", "act_inverse", "compose", "inverse", "stretched"]
 
 _COLUMNS = ("Ts_world_body", "scales", "v_world_body", "biases", "covariances")
 
@@ -60,6 +60,20 @@ def act_inverse(a: Placement, points: NDArray[np.float64]) -> NDArray[np.float64
     T, s = a
     turned = np.einsum("...ji,...j->...i", T[..., :3, :3], points - T[..., :3, 3])
     return np.asarray(turned / np.asarray(s)[..., None])
+
+
+def stretched(
+    covariances: NDArray[np.float64], by: NDArray[np.float64] | float
+) -> NDArray[np.float64]:
+    """Return covariances (..., 6, 6) of (translation, rotation) with lengths in other units.
+
+    Args:
+        covariances: in some units.
+        by: (...) how many of the other units one of these is.
+    """
+    units = np.ones((*np.shape(by), 6))
+    units[..., :3] = np.asarray(by)[..., None]
+    return np.asarray(covariances * units[..., :, None] * units[..., None, :])
 
 
 class States:
@@ -161,8 +175,6 @@ class States:
         turned = (turn @ self._velocities[rows][:, :, None])[..., 0]
         self._velocities[rows] = ratio[:, None] * turned
         if np.any(ratio != 1.0):
-            stretch = np.ones((len(rows), 6))
-            stretch[:, :3] = ratio[:, None]
-            self._covariances[rows] *= stretch[:, :, None] * stretch[:, None, :]
+            self._covariances[rows] = stretched(self._covariances[rows], ratio)
         self._Ts[rows] = Ts
         self._scales[rows] = scales

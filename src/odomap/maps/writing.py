@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from odomap.maps.landmarks import Landmarks
 from odomap.maps.observations import Observations
 from odomap.maps.snapshot import Update
-from odomap.maps.states import Placement, States, act, act_inverse, compose, inverse
+from odomap.maps.states import (
+    Placement,
+    States,
+    act,
+    act_inverse,
+    compose,
+    inverse,
+    stretched,
+)
 from odomap.maps.tree import ALIVE, Tree
 
 __all__ = ["correction", "drop_observations", "move_keyframes", "move_landmarks"]
@@ -46,9 +54,8 @@ def move_keyframes(tree: Tree, states: States, update: Update, C: Placement | No
     followers, leaders = _followers(tree, ids, update.version)
     states.move(ids, solved)
     if update.covariances is not None:
-        stretch = np.ones(6)
-        stretch[:3] = 1.0 if C is None or update.scales is None else C[1]
-        states.covariances[ids] = update.covariances[alive] * np.outer(stretch, stretch)
+        by = 1.0 if C is None or update.scales is None else C[1]
+        states.covariances[ids] = stretched(update.covariances[alive], by)
     if len(followers):
         after = solved[0][leaders], solved[1][leaders]
         delta = compose(after, inverse((before[0][leaders], before[1][leaders])))

@@ -29,7 +29,7 @@ from odomap.maps.atlas import beginnings
 from odomap.maps.edges import LOOP
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
-from odomap.maps.states import compose, inverse
+from odomap.maps.states import compose, inverse, stretched
 from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
@@ -156,12 +156,13 @@ class Closure:
             known: keyframes that are not in it have come since.
 
         Returns:
-            Of those how sure their parents were before: what a mapper that began before finds out
-            about how sure they are is relative to that.
+            Of those how sure their parents were before, in units as of now: what a mapper that
+            began before finds out about how sure they are is relative to that.
         """
         ids = map.keyframe_ids
         came = [acquaint(map, k) for k in ids[~np.isin(ids, known.keyframe_ids)].tolist()]
-        were = {k.keyframe_id: map.covariance(k.parent) for k in came if k.parent >= 0}
+        parents = {k.keyframe_id: k.parent for k in came if k.parent >= 0}
+        were = {k: (map.covariance(p), map.scale(p)) for k, p in parents.items()}
         map.apply(self._update(map))
         for keyframe in came:
             carry_covariance(map, keyframe)
@@ -169,7 +170,7 @@ class Closure:
             _fuse(map, newer, matched, found)
             T, scale = found.T_matched_keyframe, found.scale
             map.add_edge(matched, newer, T, found.information, LOOP, scale_i_j=scale)
-        return were
+        return {k: stretched(sure, map.scale(parents[k]) / of) for k, (sure, of) in were.items()}
 
     def _update(self, map: Map) -> Update:
         """Return the correction, applied to where keyframes are now."""
@@ -208,13 +209,15 @@ def _fuse(map: Map, newer: int, matched: int, found: Verified) -> None:
 
 def carry_covariance(map: Map, keyframe: Acquaintance) -> None:
     """Make a keyframe as sure as its parent is now, but for what odometry added since."""
-    growth = keyframe.growth
-    covariance = (
-        map.covariance(keyframe.parent) if keyframe.parent >= 0 else np.full((6, 6), np.nan)
-    )
+    if keyframe.parent < 0:
+        return
+    growth, covariance = keyframe.growth, map.covariance(keyframe.parent)
     if not (np.isfinite(growth).all() and np.isfinite(covariance).all()):
         return
     values, axes = np.linalg.eigh(0.5 * (growth + growth.T))
     added = (axes * np.maximum(values, 0.0)) @ axes.T
-    Ad = se3_adjoint(se3_inverse(keyframe.T_parent_keyframe))
+    added = stretched(added, map.scale(keyframe.keyframe_id))
+    T_parent_keyframe = keyframe.T_parent_keyframe.copy()
+    T_parent_keyframe[:3, 3] *= map.scale(keyframe.parent)
+    Ad = se3_adjoint(se3_inverse(T_parent_keyframe))
     map.set_covariance([keyframe.keyframe_id], Ad @ covariance @ Ad.T + added)

@@ -5,11 +5,12 @@ keyframes have to be tied together at once. Neither can ask the map keyframe by 
 what is needed is written down when a keyframe comes, which costs O(keyframes it shares with):
 
     shared     landmarks of the new keyframe that each older one sees, too
-    parent     the keyframe it was placed against, and the motion between the two
+    parent     the keyframe it was placed against, and S_p_k = S_p⁻¹ S_k, the motion between the two
     growth     Q = Σ_k − Ad(T_k_p) Σ_p Ad(T_k_p)ᵀ, by what it is less sure than that
 
 The sum of all Q on the way from the root, each carried along, is the covariance of odometry. It is
-kept apart from that of the map, in which closed loops have a part. Where a keyframe is culled, its
+kept apart from that of the map, in which closed loops have a part, and in the units of each, since
+these loops change what a unit is in the world. Where a keyframe is culled, its
 children go to its parent, and their motions and growths add up.
 
 Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate monocular SLAM system",
@@ -21,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.geometry.lie import se3_adjoint
 from odomap.maps.columns import grown
 from odomap.maps.map import Map
+from odomap.maps.states import Placement, compose, inverse, stretched
 
 __all__ = ["Acquaintance", "Covisibility", "acquaint"]
 
@@ -39,7 +41,8 @@ class Acquaintance(NamedTuple):
         shared_ids: (n,) keyframes that share landmarks with it.
         num_shared: (n,) how many.
         parent: the keyframe it was placed against, −1 for the first.
-        T_parent_keyframe: (4, 4).
+        T_parent_keyframe: (4, 4) in the units of the parent.
+        scale_parent_keyframe: units of the parent per unit of its own.
         growth: (6, 6) Q, in its own units; NaN where unknown.
     """
 
@@ -48,6 +51,7 @@ class Acquaintance(NamedTuple):
     num_shared: Index
     parent: int
     T_parent_keyframe: Array
+    scale_parent_keyframe: float
     growth: Array
 
 
@@ -61,6 +65,7 @@ class Covisibility:
     Attributes:
         parent: (R,) by keyframe id, −1 for the root.
         motion: (R, 4, 4) T_parent_keyframe by keyframe id, as it was.
+        scale: (R,) scale_parent_keyframe by keyframe id, as it was.
         growth: (R, 6, 6) by keyframe id, NaN where unknown.
     """
 
@@ -70,7 +75,7 @@ class Covisibility:
         self._pairs = np.zeros((0, 2), np.int64)
         self._num_pairs = 0
         self.parent = np.zeros(0, np.int64)
-        self.motion = np.zeros((0, 4, 4))
+        self.motion, self.scale = np.zeros((0, 4, 4)), np.zeros(0)
         self.growth = np.zeros((0, 6, 6))
 
     def __contains__(self, keyframe_id: int) -> bool:
@@ -85,12 +90,10 @@ class Covisibility:
         """Write down a keyframe; it and those it shares landmarks with become neighbours."""
         k = known.keyframe_id
         self.parent = grown(self.parent, k + 1, fill=-1)
-        self.motion, self.growth = grown(self.motion, k + 1), grown(self.growth, k + 1)
-        self.parent[k], self.motion[k], self.growth[k] = (
-            known.parent,
-            known.T_parent_keyframe,
-            known.growth,
-        )
+        self.motion, self.scale = grown(self.motion, k + 1), grown(self.scale, k + 1)
+        self.growth = grown(self.growth, k + 1)
+        self.parent[k], self.growth[k] = known.parent, known.growth
+        self.motion[k], self.scale[k] = known.T_parent_keyframe, known.scale_parent_keyframe
         mine = self._shared.setdefault(k, {})
         for other, count in zip(known.shared_ids.tolist(), known.num_shared.tolist()):
             if count < self._least or other not in self._shared:
@@ -107,16 +110,21 @@ class Covisibility:
             self._shared[other].pop(keyframe_id, None)
         children = np.flatnonzero(self.parent == keyframe_id).tolist()
         holder = int(self.parent[keyframe_id])
-        T_holder, added = self.motion[keyframe_id], self.growth[keyframe_id]
+        in_holder, added = self._motion(keyframe_id), self.growth[keyframe_id]
         if holder < 0 and children:  # the eldest child is the root from now on
             holder, *children = children
-            T_holder = se3_inverse(self.motion[holder])
-            added = _carried(self.growth[holder], self.motion[holder])
+            in_holder = inverse(self._motion(holder))
+            added = _carried(self.growth[holder], inverse(in_holder))
             self.parent[holder], self.growth[holder] = -1, np.nan
         for child in children:
-            self.growth[child] += _carried(added, se3_inverse(self.motion[child]))
-            self.motion[child] = T_holder @ self.motion[child]
+            own = self._motion(child)
+            self.growth[child] += _carried(added, inverse(own))
+            self.motion[child], self.scale[child] = compose(in_holder, own)
             self.parent[child] = holder
+
+    def _motion(self, keyframe_id: int) -> Placement:
+        """Return how a keyframe lies in its parent, as a similarity."""
+        return self.motion[keyframe_id].copy(), np.asarray(self.scale[keyframe_id])
 
     def neighbours(self, keyframe_id: int) -> Index:
         """Return the (n,) keyframes that share landmarks with one, most first, then oldest."""
@@ -145,21 +153,22 @@ def acquaint(map: Map, keyframe_id: int, of_parent: Array | None = None) -> Acqu
     """
     with map.lock:
         shared, counts = map.covisible(keyframe_id)
-        parent, scale = map.parent(keyframe_id), map.scale(keyframe_id)
+        parent = map.parent(keyframe_id)
         ends = [keyframe_id if parent < 0 else parent, keyframe_id]
-        Ts = map.Ts_world_body(ends)
-        now, own = (map.covariance(k) for k in ends)
+        Ts, (of, own) = map.Ts_world_body(ends), (map.scale(k) for k in ends)
+        now, sure = (map.covariance(k) for k in ends)
         of_parent = now if of_parent is None else of_parent
-    T = se3_inverse(Ts[0]) @ Ts[1]
-    if parent < 0:
-        growth = np.full((6, 6), np.nan)
-    else:
-        units = np.repeat([1.0 / scale, 1.0], 3)
-        growth = (own - _carried(of_parent, se3_inverse(T))) * units[:, None] * units
-    return Acquaintance(keyframe_id, shared, counts, parent, T, growth)
+    S = compose(inverse((Ts[0], np.asarray(of))), (Ts[1], np.asarray(own)))
+    growth = np.full((6, 6), np.nan)
+    if parent >= 0:
+        growth = stretched(sure, 1.0 / own) - _carried(stretched(of_parent, 1.0 / of), inverse(S))
+    return Acquaintance(keyframe_id, shared, counts, parent, S[0], float(S[1]), growth)
 
 
-def _carried(covariance: Array, T_to_from: Array) -> Array:
-    """Return a covariance (6, 6) of a tangent at one pose, of the tangent at another."""
-    Ad = se3_adjoint(T_to_from)
-    return np.asarray(Ad @ covariance @ Ad.T)
+def _carried(covariance: Array, S_to_from: Placement) -> Array:
+    """Return a covariance (6, 6) of a tangent at one pose, of the tangent at another, each in the
+    units there.
+    """
+    T, scale = S_to_from
+    Ad = se3_adjoint(T)
+    return np.asarray(Ad @ stretched(covariance, scale) @ Ad.T)

@@ -248,6 +248,7 @@ class LocalMapper:
         kept = np.flatnonzero(seen >= 2)
         T_body_world = se3_inverse(adjusted.Ts_world_body[newest])
         points_body = adjusted.created_world[kept] @ T_body_world[:3, :3].T + T_body_world[:3, 3]
+        points_body /= change.snapshot.scales[newest]
         keyframes = change.snapshot.keyframe_ids
         descriptors = _descriptors(change.window, created)[kept]
         new = map.add_landmarks(int(keyframes[newest]), points_body, descriptors)
@@ -287,10 +288,12 @@ class LocalMapper:
         """Say how sure the new keyframe's pose is; where unknown, the tracker's word stands."""
         if not change.adjusted.solution.joint_covariance.any():
             return
-        newest = int(change.snapshot.keyframe_ids[change.window.newest])
-        self._drifts[newest] = change.drift
-        covariance = self._calibration.total(change.drift, map.T_world_body(newest))
-        map.set_covariance([newest], covariance)
+        row, snapshot = change.window.newest, change.snapshot
+        newest = int(snapshot.keyframe_ids[row])
+        # A loop closed meanwhile has changed what a unit of the window is in the world.
+        drift = change.drift.stretched(map.scale(newest) / float(snapshot.scales[row]))
+        self._drifts[newest] = drift
+        map.set_covariance([newest], self._calibration.total(drift, map.T_world_body(newest)))
 
 
 def _descriptors(window: LocalWindow, created: Created) -> NDArray[np.uint8]:

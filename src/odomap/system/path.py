@@ -1,8 +1,9 @@
 """The path: frames as they hang from keyframes.
 
 A frame is stored as its pose relative to a keyframe, T_keyframe_body, never in the world. When
-keyframes move, the frames hang along; the final path is read off when it is asked for. The
-covariance of a frame is that of its keyframe, carried over, plus that of the relative pose:
+keyframes move, the frames hang along; the final path is read off when it is asked for. A frame is
+in the units of its keyframe, and is stretched with it where a loop corrects the scale. In units of
+the world its covariance is that of its keyframe, carried over, plus that of the relative pose:
 
     Σ_frame = Ad(T_body_keyframe) Σ_keyframe Ad(T_body_keyframe)ᵀ + Σ_relative.
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from odomap.geometry.lie import se3_adjoint, se3_inverse, se3_log
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.map import Map
+from odomap.maps.states import stretched
 
 __all__ = ["Path", "Placed"]
 
@@ -30,7 +32,7 @@ SIGMAS = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A frame that hangs from a keyframe.
+    """A frame that hangs from a keyframe, in the units of that keyframe.
 
     Attributes:
         stamp_ns: its time.
@@ -53,7 +55,7 @@ class Path:
         self._frames: list[Placed] = []
         self._live: list[tuple[int, Array, Array]] = []
         self._relative = np.zeros((6, 6))
-        self._fastest = np.zeros(2)
+        self._fastest, self._units = np.zeros(2), 1.0
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -63,10 +65,26 @@ class Path:
         """The last frame placed."""
         return self._frames[-1]
 
+    def hang(
+        self, stamp_ns: int, keyframe_id: int, T_world_body: Array, covariance: Array
+    ) -> Placed:
+        """Return a frame as it hangs from a keyframe.
+
+        Args:
+            stamp_ns: its time.
+            keyframe_id: the keyframe.
+            T_world_body: (4, 4) where it is.
+            covariance: (6, 6) of it relative to the keyframe, in units of the world.
+        """
+        T_keyframe_body = self._map.relative(keyframe_id, T_world_body)
+        by = 1.0 / self._map.scale(keyframe_id)
+        return Placed(stamp_ns, keyframe_id, T_keyframe_body, stretched(covariance, by))
+
     def append(self, frame: Placed) -> tuple[Array, Array]:
         """Add a frame; return its pose (4, 4) and covariance (6, 6) in the world as known now."""
+        self._measure_speeds_by(frame)
         self._frames.append(frame)
-        self._relative = frame.covariance
+        self._relative = stretched(frame.covariance, self._units)
         T_world_body, covariance = self._pose(frame), self.covariance(frame)
         self._live.append((frame.stamp_ns, T_world_body, covariance))
         speed = np.linalg.norm(self.velocity().reshape(2, 3), axis=1)
@@ -75,10 +93,12 @@ class Path:
 
     def replace_last(self, frame: Placed) -> None:
         """Hang the last frame from another keyframe: the one it has become."""
+        self._measure_speeds_by(frame)
         self._frames[-1] = frame
 
     def append_late(self, frame: Placed) -> None:
         """Add a frame that could not be placed when it came; it is no part of the live path."""
+        self._measure_speeds_by(frame)
         self._frames.append(frame)
 
     def last_pose(self) -> Array:
@@ -93,7 +113,9 @@ class Path:
         """
         if len(self._frames) < 3:
             return False
-        step = 1e-9 * (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * self._fastest
+        step = (
+            1e-9 * (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * self._highest_speed()
+        )
         sigma = np.sqrt(np.diag(covariance).reshape(2, 3).max(axis=1))
         apart = _lengths(T_expected, T_found)
         return bool((apart > np.maximum(LEAP * step, SIGMAS * sigma)).any())
@@ -123,8 +145,11 @@ class Path:
 
     def covariance(self, frame: Placed) -> Array:
         """Return the covariance (6, 6) in the world of a frame that hangs from a keyframe."""
-        Ad = se3_adjoint(se3_inverse(frame.T_keyframe_body))
-        return np.asarray(Ad @ self._map.covariance(frame.keyframe_id) @ Ad.T + frame.covariance)
+        scale, T_keyframe_body = self._map.scale(frame.keyframe_id), frame.T_keyframe_body.copy()
+        T_keyframe_body[:3, 3] *= scale
+        Ad = se3_adjoint(se3_inverse(T_keyframe_body))
+        carried = Ad @ self._map.covariance(frame.keyframe_id) @ Ad.T
+        return np.asarray(carried + stretched(frame.covariance, scale))
 
     def gap_covariance(self, stamp_ns: int) -> Array:
         """Return how unsure the last pose (6, 6) is by now: a metre and half a radian a second."""
@@ -152,6 +177,17 @@ class Path:
     def trajectory_live(self) -> Trajectory:
         """Return the frames placed at once, as they were then."""
         return _trajectory(self._live)
+
+    def _measure_speeds_by(self, frame: Placed) -> None:
+        """Let the units of a frame's keyframe be those that speeds so far are stretched with."""
+        self._fastest, self._units = self._highest_speed(), self._map.scale(frame.keyframe_id)
+
+    def _highest_speed(self) -> Array:
+        """Return the fastest (2,) so far, a length and an angle per second, in units as of now."""
+        if not self._frames:
+            return self._fastest
+        now = self._map.scale(self._frames[-1].keyframe_id)
+        return self._fastest * (now / self._units, 1.0)
 
     def _pose(self, frame: Placed) -> Array:
         return self._map.place(frame.keyframe_id, frame.T_keyframe_body)

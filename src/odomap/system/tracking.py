@@ -25,7 +25,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.geometry.lie import se3_exp, se3_inverse
+from odomap.geometry.lie import se3_exp
 from odomap.geometry.pose import SE3
 from odomap.maps.estimate import Estimate, Status, Tracks
 from odomap.maps.keyframes import Keyframe
@@ -69,10 +69,10 @@ class Known(Protocol):
 
 K = TypeVar("K", bound=Known)
 
-LEAP = 5.0
+ASTRAY = 5.0
 """Standard deviations of where a body unseen may be beyond which it has not moved by itself."""
 WELL = 2
-"""How many times the inliers needed must be settled for such a leap to be believed."""
+"""How many times the inliers needed must be settled for that to be believed."""
 CLEARLY = 1.5
 """How many times the settled landmarks of the tracked pose must agree with another to win."""
 
@@ -230,12 +230,8 @@ class Tracker(ABC, Generic[K]):
         self._since_keyframe += 1
         if self._since_keyframe == 1:
             self._first_count = located.num_inliers
-        T_world_reference = self._map.T_world_body(known.keyframe_id)
-        placed = Placed(
-            look.frame.stamp_ns,
-            known.keyframe_id,
-            se3_inverse(T_world_reference) @ located.T_world_body,
-            located.covariance,
+        placed = self.path.hang(
+            look.frame.stamp_ns, known.keyframe_id, located.T_world_body, located.covariance
         )
         before = known.keypoints[located.rows]
         before = np.where(np.isfinite(before), before, located.pixels)
@@ -359,7 +355,7 @@ class Tracker(ABC, Generic[K]):
         settled, least = self._count_settled(known, located), self._tracking.min_inliers
         if self._veil.is_shown and settled < least:  # the others may be on what hides the known
             return False
-        return bool(moved <= LEAP * sigma) or settled >= WELL * least
+        return bool(moved <= ASTRAY * sigma) or settled >= WELL * least
 
     def _count_settled(self, known: K, located: Located) -> int:
         """Count the settled landmarks that agree with a pose."""

@@ -78,6 +78,11 @@ class Drift:
         """Return that of a first keyframe, (6, 6); the scale begins here."""
         return Drift(np.pad(covariance, (0, 1)), np.zeros((3, 6)))
 
+    def stretched(self, by: float) -> "Drift":
+        """Return the same drift with lengths in other units, so many for each of these."""
+        units = np.array([by] * 3 + [1.0] * 4)
+        return Drift(self.covariance * np.outer(units, units), self.responses * units[:6])
+
     def onwards(
         self,
         T_newest_anchor: Array,
