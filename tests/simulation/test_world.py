@@ -142,7 +142,10 @@ def test_the_street_is_a_loop_of_half_a_kilometre(street: World) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"kind": "rom"}, "kind: 'rom' is none of room, street (did you mean 'room'?)"),
+        (
+            {"kind": "rom"},
+            "kind: 'rom' is none of room, building, corridor, street (did you mean 'room'?)",
+        ),
         ({"sensors": ("sterio",)}, "did you mean 'stereo'?"),
         ({"sensors": ()}, "at least one"),
         ({"sensors": ("depth",)}, "add 'mono' or 'stereo'"),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from odomap.simulation.light import Lights
 from odomap.simulation.path import Harmonics, Path, closed_route, vehicle
+from odomap.simulation.ring import Ring
 from odomap.simulation.scene import Scene, SceneBuilder
 
 __all__ = ["street"]
@@ -19,50 +20,10 @@ LANE = 1.75
 UP = np.array([0.0, 0.0, 1.0])
 
 
-class _Road:
-    """The middle line: a rounded rectangle, anticlockwise, by distance."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.length, self.width = rng.uniform(165, 200), rng.uniform(95, 120)
-        self.radius = float(rng.uniform(15, 19))
-        self._straights = np.array([self.length, self.width] * 2) - 2 * self.radius
-        arc = np.pi / 2 * self.radius
-        self._starts = np.concatenate([[0.0], np.cumsum(self._straights + arc)[:-1]])
-        self.round_m = float((self._straights + arc).sum())
-
-    def at(self, along: float, left: float = 0.0, up: float = 0.0) -> tuple[Array, Array]:
-        """Return a point beside the road and axes (columns: ahead, left, up)."""
-        along %= self.round_m
-        side = int(np.searchsorted(self._starts, along, "right")) - 1
-        rest = along - self._starts[side]
-        half = np.array([self.length, self.width]) / 2
-        corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])[side] * half
-        ahead = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], float)[side]
-        leftwards = np.array([-ahead[1], ahead[0]])
-        straight = self._straights[side]
-        point = corner + ahead * (self.radius + min(rest, straight))
-        if rest > straight:
-            angle = (rest - straight) / self.radius
-            point = point + self.radius * (ahead * np.sin(angle) + leftwards * (1 - np.cos(angle)))
-            ahead, leftwards = (
-                ahead * np.cos(angle) + leftwards * np.sin(angle),
-                leftwards * np.cos(angle) - ahead * np.sin(angle),
-            )
-        axes = np.eye(3)
-        axes[:2, 0], axes[:2, 1] = ahead, leftwards
-        return np.array([*(point + leftwards * left), up]), axes
-
-    def is_straight(self, along: float, margin: float) -> bool:
-        """Tell whether the road is straight from margin before to margin behind."""
-        along %= self.round_m
-        side = int(np.searchsorted(self._starts, along, "right")) - 1
-        rest = along - self._starts[side]
-        return bool(margin < rest < self._straights[side] - margin)
-
-    def way(self, left: float, up: float) -> Array:
-        """Return way points every 6 m or so, beside the middle."""
-        alongs = np.linspace(0, self.round_m, int(self.round_m / 6), endpoint=False)
-        return np.array([self.at(float(a), left, up)[0] for a in alongs])
+def _road(rng: np.random.Generator) -> Ring:
+    """Return the middle line of a street."""
+    length, width = rng.uniform(165, 200), rng.uniform(95, 120)
+    return Ring(length, width, float(rng.uniform(15, 19)))
 
 
 def street(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
@@ -77,7 +38,7 @@ def street(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
         The scene, and the path of the body; the road is z = 0, metres.
     """
     rng = np.random.default_rng([seed, 2])
-    road = _Road(rng)
+    road = _road(rng)
     angle = rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.2)])
     lights = Lights(
@@ -100,7 +61,7 @@ def street(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     return builder.build(), path
 
 
-def _ground(builder: SceneBuilder, road: _Road) -> None:
+def _ground(builder: SceneBuilder, road: Ring) -> None:
     """Asphalt on the road and grass beyond, in squares of 8 m near the road."""
     asphalt = builder.paint("asphalt", 2048, 2048)
     grass = builder.paint("foliage", 1024, 1024)
@@ -119,7 +80,7 @@ def _ground(builder: SceneBuilder, road: _Road) -> None:
             )  # fmt: skip
 
 
-def _markings(builder: SceneBuilder, road: _Road) -> None:
+def _markings(builder: SceneBuilder, road: Ring) -> None:
     """Dashes, patches, covers and leaves, each a little above what lies below it."""
     rng = builder.rng
     paint = builder.paint("plaster", 256, 256)
@@ -153,7 +114,7 @@ def _markings(builder: SceneBuilder, road: _Road) -> None:
         )  # fmt: skip
 
 
-def _houses(builder: SceneBuilder, road: _Road, side: float) -> None:
+def _houses(builder: SceneBuilder, road: Ring, side: float) -> None:
     """House after house, here and there a garden behind a hedge."""
     rng = builder.rng
     fronts = [builder.paint("facade", 1024, 512) for _ in range(9)]
@@ -188,7 +149,7 @@ def _houses(builder: SceneBuilder, road: _Road, side: float) -> None:
             builder.box(place + axes[:, 0] * shift, size, number, axes=axes, gain=0.9, bottom=True)
 
 
-def _pavement(builder: SceneBuilder, road: _Road, side: float) -> None:
+def _pavement(builder: SceneBuilder, road: Ring, side: float) -> None:
     """Raised slabs with a kerb, some stretches with grass between."""
     rng = builder.rng
     slabs = [builder.paint("tiles", 1024, 1024) for _ in range(2)]
@@ -227,7 +188,7 @@ def _car_paint(builder: SceneBuilder) -> tuple[int, int]:
     return builder.paint("car", 512, 128), builder.paint("cabin", 256, 64)
 
 
-def _cars(builder: SceneBuilder, road: _Road, side: float) -> None:
+def _cars(builder: SceneBuilder, road: Ring, side: float) -> None:
     """Cars parked along the kerb with gaps."""
     rng = builder.rng
     paints = [_car_paint(builder) for _ in range(4)]
@@ -239,7 +200,7 @@ def _cars(builder: SceneBuilder, road: _Road, side: float) -> None:
         along += float(rng.uniform(5.6, 14))
 
 
-def _furniture(builder: SceneBuilder, road: _Road, side: float) -> None:
+def _furniture(builder: SceneBuilder, road: Ring, side: float) -> None:
     """Trees, lamps, signs and bins on the pavement."""
     rng = builder.rng
     bark, leaves = builder.paint("wood", 64, 256), builder.paint("foliage", 256, 256)
@@ -283,7 +244,7 @@ def _tree(builder: SceneBuilder, point: Array, bark: int, leaves: int) -> None:
         )
 
 
-def _oncoming(builder: SceneBuilder, road: _Road, backwards: bool) -> None:
+def _oncoming(builder: SceneBuilder, road: Ring, backwards: bool) -> None:
     """A car on the other lane, the other way round."""
     rng = builder.rng
     way = road.way(-LANE if backwards else LANE, 0.0)

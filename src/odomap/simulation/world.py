@@ -8,7 +8,7 @@ The body is the IMU where there is one, else the first camera, else the LiDAR.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -21,6 +21,7 @@ from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame, ImuSamples
 from odomap.sensors.rig import CameraMount, DepthMount, ImuMount, LidarMount, Rig
+from odomap.simulation.building import building, corridor
 from odomap.simulation.exposure import ImageNoise, expose, measure_depth
 from odomap.simulation.imu import imu_samples
 from odomap.simulation.lidar import LidarNoise, scan, sweep
@@ -37,7 +38,10 @@ Array = NDArray[np.float64]
 START_NS = 1_700_000_000_000_000_000
 """Stamp of the first frame: an epoch of our days, so that float seconds are caught losing time."""
 SENSORS = ("stereo", "mono", "depth", "imu", "lidar2d", "lidar3d")
-KINDS = ("room", "street")
+MAKERS: Mapping[str, Callable[[int, int, float], tuple[Scene, Path]]] = MappingProxyType(
+    {"room": room, "building": building, "corridor": corridor, "street": street}
+)
+HAND_HELD = ("room", "building", "corridor")
 LENSES: Mapping[str, tuple[str, float, tuple[float, ...]]] = MappingProxyType(
     {
         "radtan": ("pinhole", 1.0, (-0.28, 0.07, 2e-4, -1e-4)),
@@ -55,17 +59,18 @@ class WorldSpec:
     """What decides a world, to the last byte."""
 
     kind: str = "room"
-    """"room" (hand-held) or "street" (on wheels)."""
+    """"room", "building" (corridors and rooms, 60 m round), "corridor" (of identical doors), all
+    hand-held, or "street" (on wheels)."""
     seed: int = 0
     """Which of the worlds of its kind."""
     frames: int = 150
     """How many there are."""
     rate_hz: float = 0.0
-    """Frames per second; 0 for 20 in a room and 10 in a street."""
+    """Frames per second; 0 for 20, and 10 in a street."""
     resolution: tuple[int, int] = (0, 0)
-    """Width and height in pixels; 0 for 640x400 in a room and 800x304 in a street."""
+    """Width and height in pixels; 0 for 640x400, and 800x304 in a street."""
     speed: float = 0.0
-    """Mean speed in m/s; 0 for 0.6 in a room and 7.5 in a street."""
+    """Mean speed in m/s; 0 for 0.6 in a room, 0.8 in a building and 7.5 in a street."""
     noise: float = 1.0
     """Factor on all imperfections of all sensors; 0 for ideal ones."""
     calibration_px: float = 0.1
@@ -82,9 +87,10 @@ class WorldSpec:
     times as long to render."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
+        if self.kind not in MAKERS:
+            known = ", ".join(MAKERS)
             raise ConfigError(
-                f"kind: '{self.kind}' is none of room, street{nearest_name(self.kind, KINDS)}"
+                f"kind: '{self.kind}' is none of {known}{nearest_name(self.kind, MAKERS)}"
             )
         lenses = ("pinhole", *LENSES)
         if self.lens not in lenses:
@@ -116,14 +122,15 @@ class WorldSpec:
 
     def completed(self) -> "WorldSpec":
         """Return the spec with the values that depend on the kind filled in."""
-        is_room = self.kind == "room"
+        is_held = self.kind in HAND_HELD
+        walk = 0.6 if self.kind == "room" else 0.8
         return replace(
             self,
-            rate_hz=self.rate_hz or (20.0 if is_room else 10.0),
-            speed=self.speed or (0.6 if is_room else 7.5),
+            rate_hz=self.rate_hz or (20.0 if is_held else 10.0),
+            speed=self.speed or (walk if is_held else 7.5),
             resolution=self.resolution
             if self.resolution != (0, 0)
-            else ((640, 400) if is_room else (800, 304)),
+            else ((640, 400) if is_held else (800, 304)),
         )
 
 
@@ -139,7 +146,7 @@ class World:
 
     def __init__(self, spec: WorldSpec) -> None:
         self.spec = spec.completed()
-        make = room if self.spec.kind == "room" else street
+        make = MAKERS[self.spec.kind]
         self.scene: Scene
         self._path: Path
         self.scene, self._path = make(self.spec.seed, self.spec.moving_objects, self.spec.speed)
@@ -261,9 +268,9 @@ class World:
 
 def _carried(spec: WorldSpec) -> Rig:
     """Return the rig with all mounts relative to the place of the IMU."""
-    is_room = spec.kind == "room"
+    is_held = spec.kind in HAND_HELD
     width, height = spec.resolution
-    focal = 0.625 * width if is_room else 0.6 * width
+    focal = 0.625 * width if is_held else 0.6 * width
     model, magnified, distortion = LENSES.get(spec.lens, ("pinhole", 1.0, ()))
     focal *= magnified
     camera = Camera(
@@ -272,13 +279,13 @@ def _carried(spec: WorldSpec) -> Rig:
         np.array(distortion),
         (width, height),
     )
-    R_imu_carrier = R_CARRIER_IMU.T if is_room else np.eye(3)
-    tilt = [0.0, 0.0, 0.0, -0.11, -0.013, 0.009] if is_room else [0, 0, 0, -0.008, 0.011, 0.004]
-    lever = [-0.024, -0.061, 0.012] if is_room else [0.81, 0.29, 0.48]
+    R_imu_carrier = R_CARRIER_IMU.T if is_held else np.eye(3)
+    tilt = [0.0, 0.0, 0.0, -0.11, -0.013, 0.009] if is_held else [0, 0, 0, -0.008, 0.011, 0.004]
+    lever = [-0.024, -0.061, 0.012] if is_held else [0.81, 0.29, 0.48]
     T_imu_left = SE3.from_parts(R_imu_carrier @ R_CARRIER_CAMERA, np.array(lever)) @ SE3.exp(
         np.array(tilt, float)
     )
-    baseline = SE3.from_parts(np.eye(3), np.array([0.11 if is_room else 0.54, 0.0, 0.0]))
+    baseline = SE3.from_parts(np.eye(3), np.array([0.11 if is_held else 0.54, 0.0, 0.0]))
     cameras: list[CameraMount] = []
     if {"stereo", "mono"} & set(spec.sensors):
         cameras.append(CameraMount("left", camera, T_imu_left, spec.rate_hz))
@@ -320,7 +327,9 @@ def _imu_mount(spec: WorldSpec) -> ImuMount:
 
 
 def _lidar_mounts(spec: WorldSpec, R_imu_carrier: Array) -> tuple[LidarMount, ...]:
-    above = R_imu_carrier @ (np.array([0.02, 0.0, 0.1]) if spec.kind == "room" else [0.0, 0.0, 0.6])
+    above = R_imu_carrier @ (
+        np.array([0.02, 0.0, 0.1]) if spec.kind in HAND_HELD else [0.0, 0.0, 0.6]
+    )
     T_imu_lidar = SE3.from_parts(R_imu_carrier, above)
     if "lidar2d" in spec.sensors:
         half = 0.75 * np.pi
