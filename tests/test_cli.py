@@ -121,6 +121,7 @@ def test_help_answers_at_once_and_loads_nothing_heavy():
         "optimize",
         "bundle",
         "export",
+        "loops",
         "info",
         "config",
         "doctor",
@@ -151,7 +152,7 @@ def test_no_words_prints_help_and_fails(cli):
         (
             ["frobnicate"],
             "one of run, localize, continue, demo, calibrate, eval, optimize, bundle, export, "
-            "vocabulary, info, view, config, doctor expected",
+            "vocabulary, loops, info, view, config, doctor expected",
         ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),

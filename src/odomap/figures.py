@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from odomap.errors import InputError
 from odomap.logbook import Logbook, skipped_numbers, versions
+from odomap.maps.edges import LOOP
 from odomap.maps.estimate import Status
 
 if TYPE_CHECKING:
@@ -45,7 +46,9 @@ def figures(
     metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
     metrics["keyframes"] = len(result.keyframes)
     metrics["landmarks"] = result.map.num_landmarks
-    metrics["loops"] = 0
+    metrics["loops"] = sum(kind == LOOP for kind in result.map.edges().kind)
+    metrics["loops_closed"] = None if logbook.loops is None else logbook.loops.num_closed
+    metrics["loops_rejected"] = None if logbook.loops is None else logbook.loops.num_rejected
     metrics["failure"] = logbook.failure(len(placed))
     if not is_mapping:
         metrics["localised"] = len(placed)

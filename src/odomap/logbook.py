@@ -25,6 +25,7 @@ from odomap.sources.source import Skipped, Source
 from odomap.version import __version__
 
 if TYPE_CHECKING:
+    from odomap.loopbook import LoopBook
     from odomap.maps.map import Map
     from odomap.views.record import Growth
 
@@ -53,12 +54,14 @@ class Logbook:
         estimates: one per frame, without tracks.
         samples: a few (frame, estimate with tracks) spread over the run.
         map: whose size is noted with every frame; None notes none.
+        loops: what was decided on loops; None where nobody looked for any.
     """
 
     def __init__(self, total: int) -> None:
         self.estimates: list[Estimate] = []
         self.samples: list[tuple[Frame, Estimate]] = []
         self.map: Map | None = None
+        self.loops: LoopBook | None = None
         self._track_ms: list[float] = []
         self._keyframes, self._landmarks = array("q"), array("q")
         self._memory_mb = array("d")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from odomap.errors import OutputError
 from odomap.files.atomic import make_folder, write_text
+from odomap.files.loops import LOOPS_FILE, LoopLog, write_loops
 from odomap.files.mapfile import save_map
 from odomap.files.trajectories import write_tum
 from odomap.logbook import Logbook
@@ -128,6 +129,7 @@ class Outputs:
             ),
             ("keyframes.tum", lambda: write_tum(self._at("keyframes.tum"), result.keyframes)),
             ("map.odomap", lambda: self._write_map(source, result, metrics)),
+            *self._loops(source, result, logbook),
             ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
             ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
             (
@@ -159,6 +161,19 @@ class Outputs:
         verb = "continue" if self._is_mapping else "localize"
         head = f"odomap {verb} {self._map}" if self._map else "odomap run"
         return f"{head} {self._data} --config {self.folder / 'config.yaml'}"
+
+    def _loops(
+        self, source: "Source", result: "Result", logbook: Logbook
+    ) -> list[tuple[str, Callable[[], object]]]:
+        """Return the job of writing what became of loops, where they were looked for."""
+        file = self._at(LOOPS_FILE)
+        if logbook.loops is None:
+            remove(file)  # that of another run
+            return []
+        start = logbook.estimates[0].stamp_ns if logbook.estimates else 0
+        decided = logbook.loops.records(logbook.estimates)
+        loops = LoopLog(source.name, result.is_metric, start, decided)
+        return [(LOOPS_FILE, lambda: write_loops(file, loops))]
 
     def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
         file = self._at("map.odomap")
@@ -233,10 +248,15 @@ class Outputs:
     def _forget_live(self) -> None:
         """Give up the appended path, and the space it took."""
         self._live = None
-        try:
-            self._part.unlink(missing_ok=True)
-        except OSError:
-            return  # nothing more can be done with it, and the final path does not need it
+        remove(self._part)
+
+
+def remove(path: Path) -> None:
+    """Remove a file that says nothing any more, if that can be done."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return  # nothing more can be done with it, and the other files do not need it
 
 
 def _row(estimate: Estimate) -> str:

@@ -26,6 +26,7 @@ from odomap.errors import CalibrationError, InputError
 from odomap.figures import figures
 from odomap.geometry.trajectory import Trajectory
 from odomap.logbook import Logbook, spread
+from odomap.loopbook import LoopBook
 from odomap.maps.estimate import Estimate
 from odomap.settings import override, read_config
 
@@ -178,7 +179,7 @@ def run(
     compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
     system = choice.make(source.rig, settings, head["data"])
-    logbook.map = None if odometry_only else system.map
+    logbook.map, logbook.loops = None if odometry_only else system.map, LoopBook.of(system.worker)
     shown = watching(view, system, source.rig, settings)
     with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
@@ -191,13 +192,13 @@ def run(
         if broken is not None:
             state["failure"] = f"tracking stopped: {broken}"
         notes = choice.notes(settings)
-        finished = _concluded(source, logbook, result, outputs, state, notes, tell)
+        done = _concluded(source, logbook, result, outputs, state, notes, tell)
     if broken is not None:
         kept = "" if outputs is None else f"; what was tracked before is in {outputs.folder}"
         raise type(broken)(f"{head['data']}: {broken}{kept}") from broken
     if interrupt.is_set():
-        raise Interrupted(finished)
-    return finished
+        raise Interrupted(done)
+    return done
 
 
 def chosen_config(

@@ -20,6 +20,7 @@ from odomap.cli.evaluate import Evaluate
 from odomap.cli.export import Export
 from odomap.cli.info import Info
 from odomap.cli.localize import Continue, Localize
+from odomap.cli.loops import Loops
 from odomap.cli.optimize import Optimize
 from odomap.cli.run import Run
 from odomap.cli.view import ViewVerb
@@ -40,6 +41,7 @@ VERBS: dict[str, Any] = {
     "bundle": Bundle,
     "export": Export,
     "vocabulary": VocabularyVerb,
+    "loops": Loops,
     "info": Info,
     "view": ViewVerb,
     "config": ConfigVerb,

@@ -26,7 +26,8 @@ class Run:
     """Track a recording; write its path, map, numbers and a report.
 
     Writes trajectory.tum, trajectory_live.tum, keyframes.tum, map.odomap, metrics.json, config.yaml
-    and report.html. Any field that `odomap config` prints can be set as --section.field VALUE.
+    and report.html, and loops.json where loops are looked for. Any field that `odomap config`
+    prints can be set as --section.field VALUE.
     """
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
@@ -176,6 +177,8 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
         rate = f"{m['real_time_factor']:.2f} x real time" if m["real_time_factor"] else ""
         lines.append(("ms per frame", f"{ms['median']:.1f} median, {ms['p95']:.1f} p95  {rate}"))
         lines.append(("map", f"{m['keyframes']} keyframes, {m['landmarks']} landmarks"))
+        if m["loops_closed"] or m["loops_rejected"]:
+            lines.append(("loops", loops_text(m["loops_closed"], m["loops_rejected"])))
         unit = "m" if m["is_metric"] else "units (no scale)"
         lines.append(("path", f"{m['path_m']:.3f} {unit} in {m['duration_s']:.2f} s"))
     if m.get("ate_rmse_m") is not None:
@@ -185,3 +188,13 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
         lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}{fitted}"))
     lines.append(("peak memory", f"{m['peak_memory_mb']:.0f} MB"))
     return lines
+
+
+def loops_text(closed: int, rejected: int) -> str:
+    """Say how many candidates for loops were believed, and how many were not.
+
+    Example:
+        >>> loops_text(3, 1)
+        '3 closed, 1 candidate rejected'
+    """
+    return f"{closed} closed, {rejected} candidate{'' if rejected == 1 else 's'} rejected"

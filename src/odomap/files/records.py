@@ -65,16 +65,24 @@ def write_json(path: str | Path, content: Any) -> None:
     )
 
 
-def read_json(path: str | Path) -> Any:
+def read_json(path: str | Path, packed: bool = True) -> Any:
     """Read JSON.
+
+    Args:
+        path: the file.
+        packed: whether gzip is unpacked, which may be much larger than the file.
 
     Raises:
         InputError: it cannot be read, or is not JSON.
     """
     try:
-        return json.loads(read_text(Path(path)))
+        return json.loads(read_text(Path(path), packed))
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno}: not valid JSON: {error.msg}") from error
+        is_cut = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated")
+        why = f"{error.msg}{' (is it cut short?)' if is_cut else ''}"
+        raise InputError(f"{path}:{error.lineno}: not valid JSON: {why}") from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, nested lists
+        raise InputError(f"{path}: not valid JSON: nobody writes such numbers or lists") from error
 
 
 def write_yaml(path: str | Path, content: Any) -> None:

@@ -39,15 +39,19 @@ class Table:
         return len(self.lines)
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, packed: bool = True) -> str:
     """Read a text file, unpacking gzip.
+
+    Args:
+        path: the file.
+        packed: False takes gzip for a text like any other.
 
     Raises:
         InputError: it is missing, unreadable or a broken gzip.
     """
     try:
         data = path.read_bytes()
-        if data[:2] == _GZIP:
+        if packed and data[:2] == _GZIP:
             data = gzip.decompress(data)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise InputError(f"{path}: broken gzip ({error}): copy it again") from error

@@ -30,11 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
+from odomap.geometry.lie import so3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import Closure, Reading, Tie, carry_covariance, read_essentials
 from odomap.system.covisibility import Acquaintance
-from odomap.system.essentialgraph import Essentials, LoopEdges, correct
+from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
 from odomap.system.loopsides import LoopSide, read_side
 from odomap.system.revisits import Revisit
@@ -191,8 +192,7 @@ class LoopCloser:
                 )
                 corrected = correct(essentials, edge, self._with_scale)
                 if corrected.is_accepted:
-                    merges = bool(corrected.is_merging[0])
-                    loops.append(replace(loop, is_accepted=True, merges=merges))
+                    loops.append(_closed(loop, essentials, corrected))
                     return loops, Closure((Tie(*ends, found),), essentials, corrected)
                 loop = replace(loop, reason=corrected.reason)
             loops.append(loop)
@@ -274,13 +274,27 @@ class ClosingChange:
             self.closer.write(self.closure, map)
 
 
+def _closed(loop: Loop, before: Essentials, after: Corrected) -> Loop:
+    """Return a loop that is believed, with what it does to the keyframe that came back."""
+    k = int(np.searchsorted(before.keyframe_ids, loop.keyframe_id))
+    T, T_new = before.Ts_world_body[k], after.Ts_world_body[k]
+    return replace(
+        loop,
+        is_accepted=True,
+        merges=bool(after.is_merging[0]),
+        moved=float(np.linalg.norm(T_new[:3, 3] - T[:3, 3])),
+        turned=float(np.linalg.norm(so3_log(T[:3, :3].T @ T_new[:3, :3]))),
+        rescaled=float(after.scales[k] / before.scales[k]),
+    )
+
+
 def _log(loops: list[Loop]) -> None:
     for loop in loops:
         ends = loop.keyframe_id, loop.matched_id
         if loop.is_accepted:
-            text = "keyframe %d is back at %d: %d inliers%s"
+            text = "keyframe %d is back at %d: %d inliers, moved by %.3g%s"
             merged = ", two pieces are one" if loop.merges else ""
-            logging.getLogger(__name__).info(text, *ends, loop.num_inliers, merged)
+            logging.getLogger(__name__).info(text, *ends, loop.num_inliers, loop.moved, merged)
         else:
             text = "keyframe %d is not back at %d: %s"
             logging.getLogger(__name__).info(text, *ends, loop.reason)

@@ -44,6 +44,9 @@ class Loop:
         reason: why not; empty when it was.
         merges: whether it makes one of two pieces of the map (`maps/atlas`), the newer of which
             was moved as a whole.
+        moved: by how much the correction moved the keyframe, world units.
+        turned: by how much it turned it, radians.
+        rescaled: units of the keyframe after it per unit before; 1 where scale does not drift.
     """
 
     keyframe_id: int
@@ -53,6 +56,9 @@ class Loop:
     is_accepted: bool
     reason: str = ""
     merges: bool = False
+    moved: float = 0.0
+    turned: float = 0.0
+    rescaled: float = 1.0
 
 
 @dataclass(frozen=True)
