@@ -265,6 +265,6 @@ def _trolley(builder: SceneBuilder, ring: Ring) -> None:
     route = closed_route(ring.way(-0.8, 0.0, 0.75))
     start = float(rng.uniform())
     number = builder.mover(Path(route, rate, still[0], still[1], still[2], start=start))
-    size = (*rng.uniform(0.3, 0.5, 2), float(rng.uniform(0.6, 1.3)))
+    wide, deep, tall = (float(x) for x in rng.uniform([0.3, 0.3, 0.6], [0.5, 0.5, 1.3]))
     poster = builder.paint("poster", 256, 256)
-    builder.box(UP * size[2] / 2, size, poster, mover=number)
+    builder.box(UP * tall / 2, (wide, deep, tall), poster, mover=number)
