@@ -252,9 +252,9 @@ def _open_room(builder: SceneBuilder, paints: _Paints, bay: _Bay) -> None:
     table = bay.at(float(rng.uniform(-0.4, 0.4)), 0.72, -1.3)
     builder.box(table, (0.8, 1.3, 0.05), paints.wood[1], axes=bay.axes, bottom=True)
     for _ in range(3):
-        size = tuple(rng.uniform(0.1, 0.3, 3))
-        at = table + bay.right * rng.uniform(-0.5, 0.5) + UP * (0.03 + size[2] / 2)
-        builder.box(at, size, _any(rng, paints.cartons), axes=bay.axes)
+        carton = tuple(rng.uniform(0.1, 0.3, 3))
+        at = table + bay.right * rng.uniform(-0.5, 0.5) + UP * (0.03 + carton[2] / 2)
+        builder.box(at, carton, _any(rng, paints.cartons), axes=bay.axes)
 
 
 def _trolley(builder: SceneBuilder, ring: Ring) -> None:
