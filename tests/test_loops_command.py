@@ -226,7 +226,7 @@ def listed(tmp_path, cli, *records, is_metric=True):
 
 
 def test_the_table_says_when_where_how_far_and_why_not(tmp_path, cli):
-    head, names, no, yes = listed(tmp_path, cli, refused(), record())
+    head, names, yes, no = listed(tmp_path, cli, refused(), record())
     assert head == "street: 1 closed, 1 candidate rejected"
     assert " ".join(names.split()) == "back at seen before at inliers path moved"
     assert " ".join(no.split()) == f"rejected 40.20 s, frame 402 0.30 s, frame 3 9 - {REASON}"
