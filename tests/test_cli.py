@@ -151,8 +151,8 @@ def test_no_words_prints_help_and_fails(cli):
         (["rnu", "x"], "unknown command 'rnu' (did you mean 'run'?)"),
         (
             ["frobnicate"],
-            "one of run, localize, continue, demo, calibrate, eval, optimize, bundle, export, "
-            "vocabulary, loops, info, view, config, doctor expected",
+            "one of run, localize, continue, merge, demo, calibrate, eval, optimize, bundle, "
+            "export, vocabulary, loops, info, view, config, doctor expected",
         ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),

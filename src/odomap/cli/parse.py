@@ -21,6 +21,7 @@ from odomap.cli.export import Export
 from odomap.cli.info import Info
 from odomap.cli.localize import Continue, Localize
 from odomap.cli.loops import Loops
+from odomap.cli.merge import Merge
 from odomap.cli.optimize import Optimize
 from odomap.cli.run import Run
 from odomap.cli.view import ViewVerb
@@ -34,6 +35,7 @@ VERBS: dict[str, Any] = {
     "run": Run,
     "localize": Localize,
     "continue": Continue,
+    "merge": Merge,
     "demo": Demo,
     "calibrate": Calibrate,
     "eval": Evaluate,

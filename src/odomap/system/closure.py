@@ -142,11 +142,13 @@ class Closure:
         ties: the loops, one at least.
         before: the path that was read.
         after: the path corrected.
+        fused: others that say the same: of these only landmarks are fused.
     """
 
     ties: tuple[Tie, ...]
     before: Essentials
     after: Corrected
+    fused: tuple[Tie, ...] = ()
 
     def write(self, map: Map, known: Covisibility) -> dict[int, Array]:
         """Move the keyframes, fuse what is one, and keep the measurement.
@@ -166,8 +168,9 @@ class Closure:
         map.apply(self._update(map))
         for keyframe in came:
             carry_covariance(map, keyframe)
+        for tie in (*self.ties, *self.fused):
+            _fuse(map, *tie)
         for newer, matched, found in self.ties:
-            _fuse(map, newer, matched, found)
             T, scale = found.T_matched_keyframe, found.scale
             map.add_edge(matched, newer, T, found.information, LOOP, scale_i_j=scale)
         return {k: stretched(sure, map.scale(parents[k]) / of) for k, (sure, of) in were.items()}

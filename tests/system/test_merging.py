@@ -1,0 +1,186 @@
+"""Maps made apart that become one, on circuits without images; and those that must not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odomap.files.vocabulary import Vocabulary
+from odomap.geometry.lie import se3_exp, se3_inverse
+from odomap.maps.atlas import Atlas
+from odomap.maps.map import Map
+from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.loopsearch import ClosingConfig, LoopSearch
+from odomap.system.merging import MergeConfig, Merger
+from odomap.vision.matching import MatchConfig
+from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
+
+HALF = 50
+ENABLED = ClosingConfig(enabled=True)
+
+
+@pytest.fixture(scope="module")
+def vocabulary():
+    return Vocabulary.load()
+
+
+def verifier(with_scale=False):
+    return SideVerifier(CAMERA, np.eye(4), PIXELS, SCALE, with_scale, MatchConfig())
+
+
+def grown(circuit, unit=1.0):
+    """Add all keyframes of a circuit, in units of their own."""
+    circuit.units = unit * circuit.units
+    circuit.step_sigma = circuit.step_sigma * np.repeat([unit, 1.0], 3)
+    while circuit.count < len(circuit.true):
+        circuit.add()
+    return circuit
+
+
+def halves(seed, unit=1.0, walls=None):
+    """Return two circuits, the second of which is mapped in a world of its own."""
+    walls = Walls.make() if walls is None else walls
+    first = grown(Circuit(around(HALF, laps=0.6), walls, seed=seed))
+    second = Circuit(around(HALF, laps=0.6, start=np.pi), walls, seed=seed + 10)
+    there = second.true[0]
+    away = se3_inverse(there @ se3_exp(np.array([5.0, -3.0, 1.0, 0.5, 1.0, -0.7])))
+    second.true = away @ second.true
+    second.walls = replace(walls, points=walls.points @ away[:3, :3].T + away[:3, 3])
+    return first, grown(second, unit), se3_inverse(away)
+
+
+def errors(m, first, second, T_first_second):
+    """Return how far the keyframes of a merged map are from where they were, (K,)."""
+    true = np.concatenate([first.true, T_first_second @ second.true])
+    return np.linalg.norm(m.Ts_world_body(m.keyframe_ids)[:, :3, 3] - true[:, :3, 3], axis=1)
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def bytes_of(m):
+    tables = m.dump()
+    return b"".join(tables.columns[name].tobytes() for name in sorted(tables.columns))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("unit", [1.0, 0.4])
+def test_two_halves_of_a_circuit_become_one_map(vocabulary, seed, unit):
+    first, second, T = halves(seed, unit)
+    before = bytes_of(first.map), bytes_of(second.map)
+    merging = Merger(vocabulary, verifier(unit != 1.0), unit != 1.0).merge(first.map, second.map)
+    m = merging.map
+    assert merging.reason == ""
+    assert (bytes_of(first.map), bytes_of(second.map)) == before
+    assert rms(errors(m, first, second, T)) < 0.004 * 1.2 * 2 * np.pi * 8.0
+    assert merging.scale == pytest.approx(1.0 / unit, rel=0.02)
+    np.testing.assert_allclose(m.states.scales[HALF:], 1.0 / unit, rtol=0.02)
+    np.testing.assert_allclose(m.states.scales[:HALF], 1.0, rtol=0.02)
+    np.testing.assert_allclose(merging.T_first_second[:3, :3], T[:3, :3], atol=0.02)
+    # The parts in common are known by the same landmarks, and it is one piece.
+    assert merging.num_fused > 500
+    assert m.num_landmarks == first.map.num_landmarks + second.map.num_landmarks - merging.num_fused
+    assert len(Atlas(m).pieces) == 1
+    believed = [loop for loop in merging.loops if loop.is_accepted]
+    assert merging.num_places == len(believed) >= 10
+    kinds = m.edges().kind
+    assert kinds.count("gap") == 1
+    # Both ends overlap; neighbours say the same, and few of them become edges.
+    assert 2 <= kinds.count("loop") <= len(believed) / 4
+    for loop in believed[::5]:
+        assert loop.merges
+        assert loop.matched_id in m.covisible(loop.keyframe_id)[0]
+    # How sure the second half is comes from the places in common.
+    spread = np.trace(m.states.covariances[HALF:, :3, :3], axis1=1, axis2=2)
+    relative = errors(m, first, second, T)[HALF:] / np.sqrt(spread)
+    assert 0.1 < rms(relative) < 2.0
+
+
+def test_a_merged_map_is_the_same_on_every_run(vocabulary):
+    first, second, _ = halves(4)
+    maps = [Merger(vocabulary, verifier(), False).merge(first.map, second.map) for _ in range(2)]
+    assert bytes_of(maps[0].map) == bytes_of(maps[1].map)
+
+
+def test_maps_of_different_places_have_nothing_in_common(vocabulary):
+    first, _, _ = halves(1)
+    _, second, _ = halves(1, walls=Walls.make(seed=5))
+    told = []
+    merger = Merger(vocabulary, verifier(), False)
+    merging = merger.merge(first.map, second.map, lambda *step: told.append(step))
+    assert merging.num_places == 0
+    assert "place in common" in merging.reason
+    assert len(Atlas(merging.map).pieces) == 2
+    assert [step[:2] for step in told] == [(n, HALF) for n in range(HALF)]
+    for loop in merging.loops:
+        assert loop.reason
+
+
+class Contradictory(SideVerifier):
+    """A verifier that measures something else every time."""
+
+    def verify(self, newer, matched, seed):
+        found = super().verify(newer, matched, seed)
+        T = se3_exp(np.random.default_rng(seed).normal(size=6) * [9, 9, 9, 1, 1, 1])
+        return replace(found, T_matched_keyframe=T)
+
+
+def test_places_that_do_not_agree_are_none(vocabulary):
+    first, second, _ = halves(2)
+    check = Contradictory(CAMERA, np.eye(4), PIXELS, SCALE, False, MatchConfig())
+    merging = Merger(vocabulary, check, False, config=MergeConfig(agreeing=3)).merge(
+        first.map, second.map
+    )
+    assert "agree" in merging.reason
+    assert "3 needed" in merging.reason
+    assert len(merging.loops) > 10
+    assert not any(loop.is_accepted for loop in merging.loops)
+
+
+def test_an_empty_map_has_nothing_in_common_with_another(vocabulary):
+    first, _, _ = halves(1)
+    for pair in ((first.map, Map()), (Map(), first.map)):
+        merging = Merger(vocabulary, verifier(), False).merge(*pair)
+        assert merging.reason
+
+
+# ---- within a run ----
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.4])
+def test_a_piece_begun_after_a_loss_is_merged_where_the_camera_comes_back(vocabulary, unit):
+    """Lost at two thirds of a round, and on from there somewhere, in other units."""
+    with_scale, lost = unit != 1.0, 50
+    circuit = Circuit(around(90, laps=1.25), Walls.make(), seed=1)
+    search = LoopSearch(vocabulary, ENABLED)
+    closer = LoopCloser(circuit.map, search, verifier(with_scale), with_scale, ENABLED)
+    changes = []
+    while circuit.count < len(circuit.true):
+        if circuit.count == lost:
+            circuit.known.clear()
+            circuit.units[lost:] *= unit
+            circuit.step_sigma = circuit.step_sigma * np.repeat([unit, 1.0], 3)
+        keyframe = circuit.add()
+        if keyframe.id == lost:
+            _leave(circuit, lost, unit)
+        change = closer.add(keyframe).solve()
+        change.write(circuit.map)
+        changes.append(change)
+    merges = [loop for change in changes for loop in change.loops if loop.merges]
+    assert len(merges) == 1
+    assert merges[0].is_accepted
+    (piece,) = Atlas(circuit.map).pieces
+    assert piece.merged == (lost,)
+    assert rms(circuit.errors()) < 0.004 * 1.25 * 2 * np.pi * 8.0
+    np.testing.assert_allclose(circuit.map.states.scales[lost:], 1.0 / unit, rtol=0.02)
+
+
+def _leave(circuit, lost, unit):
+    """Put the newest keyframe where it is not, as a start anew after a loss does."""
+    m = circuit.map
+    m.states.Ts_world_body[lost] = m.T_world_body(lost - 1) @ se3_exp(
+        np.array([2.0, 1.0, -3.0, 0.3, 0.8, -0.2])
+    )
+    m.states.covariances[lost] = np.diag([9.0, 9.0, 9.0, 4.0, 4.0, 4.0])
+    m.begin_piece(lost)
