@@ -24,12 +24,10 @@ _PACKAGE = Path(__file__).parent
 
 LATE = ("odomap.geometry.", "odomap.maps.views_kernels")
 """Modules that are often used without their kernels, which are imported at their first use."""
-RARE = (
-    "odomap.geometry.alignransac_kernels",
-    "odomap.geometry.horn_kernels",
-    "odomap.vision.kmajority",
-)
-"""Modules that only serve where loops are closed or words are trained."""
+LOOPS = ("odomap.geometry.alignransac_kernels", "odomap.geometry.horn_kernels")
+"""Those of them that only serve where loops are closed."""
+CLOSER = "odomap.system.closing"
+"""Imported where loops are closed."""
 F = TypeVar("F", bound=Callable[..., object])
 
 
@@ -82,8 +80,10 @@ def needed_modules() -> list[str]:
     Once a system is made, what it did not import it does not need.
     """
     imported = set(sys.modules)  # looking for kernels imports packages
-    names = [n for n in modules_with_kernels() if n in imported or n.startswith(LATE)]
-    return [n for n in names if n not in RARE]
+    late = [n for n in modules_with_kernels() if n.startswith(LATE)]
+    if CLOSER not in imported:
+        late = [n for n in late if n not in LOOPS]
+    return [n for n in modules_with_kernels() if n in imported or n in late]
 
 
 def warm_up(name: str) -> float:

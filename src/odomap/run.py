@@ -176,11 +176,11 @@ def run(
     outputs = Outputs(out, settings, head) if out is not None else None
 
     tell = progress or (lambda _: None)
-    compile_s = _warm_up(tell)
     logbook = Logbook(_expected(source, max_frames))
     system = choice.make(source.rig, settings, head["data"])
     logbook.map, logbook.loops = None if odometry_only else system.map, LoopBook.of(system.worker)
     shown = watching(view, system, source.rig, settings)
+    compile_s = _warm_up(tell)
     with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
             broken = _track(source, system, logbook, outputs, max_frames, tell, interrupt, see)
@@ -238,10 +238,8 @@ def _opened(data: str | Path, rig: "Rig | str | Path | None") -> "Source":
 def _warm_up(tell: Callable[[Progress], None]) -> float:
     """Compile, or load from the cache, the kernels of what is imported; return the seconds.
 
-    By now the source is open and the system imported.
+    By now the source is open and the system made: what it needs it has imported.
     """
-    import odomap.system.odometry
-    import odomap.system.slam  # noqa: F401 (they load the modules whose kernels a run needs)
     from odomap.kernels import needed_modules, warm_up
 
     start = time.perf_counter()

@@ -324,4 +324,5 @@ def warm_up() -> None:
     R, t, H, M = np.eye(3), np.zeros(3), np.zeros((7, 7)), np.zeros((7, 7))
     inliers, samples = np.zeros(5, np.bool_), np.array([[0, 1, 2]])
     search_alignment(samples, p, x, w, p, x, w, 1.0, 0.99, True, R, t, inliers)
+    score_alignment(R, t, 1.0, p, x, w, p, x, w, 1.0, inliers)
     refine_alignment_into(R, t, 1.0, p, x, w, p, x, w, w, 2.0, True, 2, H, M)

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 from odomap.errors import InputError
 from odomap.kernels import kernel
 from odomap.vision.hamming import NO_DISTANCE, as_words, hamming
-from odomap.vision.kmajority import grow
 
 __all__ = ["BagOfWords", "VocabularyTree", "warm_up"]
 
@@ -149,6 +148,8 @@ class VocabularyTree:
             >>> len(VocabularyTree.train(images, branching=2, depth=2).weights)
             4
         """
+        from odomap.vision.kmajority import grow  # compiled for training alone
+
         _check_sizes(branching, depth)
         parts = descriptors[:, None] if isinstance(descriptors, np.ndarray) else descriptors
         parts = [_checked(part) for part in parts if len(part)]

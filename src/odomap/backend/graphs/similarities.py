@@ -98,3 +98,4 @@ def warm_up() -> None:
     )
     into = TargetArrays(held[:1], held, held, np.zeros(49), np.zeros(7))
     linearise_similarities(Ts, edges, 0, 1.0, into, np.empty(1))
+    cost_of_similarities(Ts, edges, 0, 1.0, np.empty(1))
