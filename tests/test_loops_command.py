@@ -288,7 +288,7 @@ def test_of_many_refused_the_nearest_are_listed(tmp_path, cli):
     many = [refused(keyframe_id=k, num_inliers=(7 * k) % 30) for k in range(30)]
     lines = listed(tmp_path, cli, *many[:15], record(), *many[15:])
     assert lines[2].split()[0] == "closed"
-    shown = [int(line.split()[7]) for line in lines[3:-1]]
+    shown = [int(line.split()[9]) for line in lines[3:-1]]
     assert sorted(shown) == list(range(20, 30))
     assert shown != sorted(shown)  # in the order of time
     assert lines[-1].strip() == "... and 20 with fewer inliers: --all lists them"

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from odomap.sources.source import Source
     from odomap.system.config import Config
     from odomap.system.visual import Result
+    from odomap.views.loopview import LoopView
     from odomap.views.record import Report
 
 __all__ = ["Outputs"]
@@ -170,9 +171,7 @@ class Outputs:
         if logbook.loops is None:
             remove(file)  # that of another run
             return []
-        start = logbook.estimates[0].stamp_ns if logbook.estimates else 0
-        decided = logbook.loops.records(logbook.estimates)
-        loops = LoopLog(source.name, result.is_metric, start, decided)
+        loops = loop_log(source, result, logbook)
         return [(LOOPS_FILE, lambda: write_loops(file, loops))]
 
     def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
@@ -227,7 +226,19 @@ class Outputs:
             growth=logbook.growth(),
             mapping=metrics["mapping"] or {},
             beside_ms=metrics.get("beside_ms", {}),
+            loops=self._loop_view(source, result, logbook, scale),
         )
+
+    def _loop_view(
+        self, source: "Source", result: "Result", logbook: Logbook, scale: float
+    ) -> "LoopView | None":
+        """Return what the report shows of loops."""
+        if logbook.loops is None:
+            return None
+        from odomap.views.loopview import LoopView
+
+        log = loop_log(source, result, logbook)
+        return LoopView.of(log, result.trajectory_live, result.map, scale)
 
     def _write_report(self, report: "Report") -> None:
         from odomap.views.report import write_report
@@ -249,6 +260,14 @@ class Outputs:
         """Give up the appended path, and the space it took."""
         self._live = None
         remove(self._part)
+
+
+def loop_log(source: "Source", result: "Result", logbook: Logbook) -> LoopLog:
+    """Return what was decided on loops, where they were looked for."""
+    assert logbook.loops is not None
+    start = logbook.estimates[0].stamp_ns if logbook.estimates else 0
+    decided = logbook.loops.records(logbook.estimates)
+    return LoopLog(source.name, result.is_metric, start, decided)
 
 
 def remove(path: Path) -> None:

@@ -11,13 +11,15 @@ of the observations).
 Reference: H. Strasdat et al., Double window optimisation for constant time visual SLAM, ICCV 2011.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.maps.edges import GAP, LOOP
 from odomap.maps.map import Map
+from odomap.views.loopview import edges_of
 
 __all__ = ["MapView"]
 
@@ -39,6 +41,8 @@ class MapView:
         shared: (P,) how many they share, at least `least`.
         num_pairs: how many such pairs there are in all.
         least: landmarks that a pair shares at least.
+        loops: (L, 2, 3) ends of the loops that were closed, in the world.
+        gaps: (G, 2, 3) keyframes between which nothing is known of how they lie to each other.
     """
 
     keyframes: NDArray[np.float64]
@@ -47,6 +51,8 @@ class MapView:
     shared: NDArray[np.int64]
     num_pairs: int
     least: int = STRONG
+    loops: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    gaps: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2, 3)))
 
     @classmethod
     def of(cls, map: Map, scale: float = 1.0, least: int = STRONG, most: int = PAIRS) -> Self:
@@ -66,7 +72,16 @@ class MapView:
         table = np.concatenate([np.zeros((0, 3), np.int64), *rows])
         table = table[table[:, 2] >= least]
         kept = table[np.argsort(table[:, 2], kind="stable")][max(len(table) - most, 0) :]
-        return cls(scale * keyframes, scale * landmarks, kept[:, :2], kept[:, 2], len(table), least)
+        return cls(
+            scale * keyframes,
+            scale * landmarks,
+            kept[:, :2],
+            kept[:, 2],
+            len(table),
+            least,
+            scale * edges_of(map, LOOP),
+            scale * edges_of(map, GAP),
+        )
 
 
 def _later(

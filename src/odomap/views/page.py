@@ -11,7 +11,7 @@ import html
 from collections.abc import Iterable, Sequence
 from importlib import resources
 
-__all__ = ["details", "image", "page", "section", "swatch", "table", "text"]
+__all__ = ["details", "folded", "image", "page", "section", "swatch", "table", "text"]
 
 
 def text(value: object) -> str:
@@ -46,6 +46,11 @@ def swatch(colour: str | None) -> str:
 def details(summary: str, body: str) -> str:
     """Fold text away under a summary, both escaped."""
     return f"<details><summary>{text(summary)}</summary><pre>{text(body)}</pre></details>"
+
+
+def folded(summary: str, body: str) -> str:
+    """Fold HTML away under a summary, which is escaped."""
+    return f"<details><summary>{text(summary)}</summary>{body}</details>"
 
 
 def image(data: bytes, kind: str, alt: str) -> str:

@@ -16,6 +16,7 @@
   };
   // All arrays come as x, y, z with z up.
   const path = floats(data.path), truth = floats(data.truth), points = floats(data.points);
+  const loops = floats(data.loops);
   const forward = floats(data.forward), times = floats(data.times), colours = data.colours;
   const count = path.length / 3;
 
@@ -46,7 +47,7 @@
   reset();
 
   let width = 0, height = 0, palette = {};
-  const names = ["ink", "muted", "grid", "estimate", "truth", "keyframe", "good", "lost"];
+  const names = ["ink", "muted", "grid", "estimate", "truth", "keyframe", "good", "lost", "loop"];
   const colour = () => {
     const style = getComputedStyle(document.documentElement);
     for (const name of names) palette[name] = style.getPropertyValue("--" + name).trim();
@@ -108,6 +109,8 @@
     } else
       for (const [from, to] of data.pieces)
         for (let i = from; i < to; i++) { ctx.strokeStyle = colours[i + 1]; line(path, i, i + 1); }
+    ctx.strokeStyle = palette.loop; ctx.lineWidth = 2.5;
+    for (let i = 0; i < loops.length / 3; i += 2) line(loops, i, i + 1);
     ctx.fillStyle = palette.keyframe;
     for (const i of data.keyframes) {
       const [u, v] = project(path[3 * i], path[3 * i + 1], path[3 * i + 2]);

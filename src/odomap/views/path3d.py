@@ -30,6 +30,7 @@ def path3d_data(
     keyframe_stamps_ns: NDArray[np.int64],
     points: NDArray[np.float64] | None,
     unit: str = "m",
+    loops: NDArray[np.float64] | None = None,
 ) -> str:
     """Pack a scene for the page's script.
 
@@ -38,6 +39,7 @@ def path3d_data(
         keyframe_stamps_ns: stamps of keyframes.
         points: (M, 3) landmarks in the estimate's world, metres, or None.
         unit: what lengths are in; "units" where a path has no scale.
+        loops: (L, 2, 3) ends of loops in the estimate's world, or None.
 
     Returns:
         JSON that is safe inside a script element.
@@ -60,6 +62,7 @@ def path3d_data(
         "path": _packed(path),
         "truth": _packed(truth),
         "points": _packed(_landmarks(place, points)[:, order] * sign),
+        "loops": _packed(_ends(place, loops)[:, order] * sign),
         "forward": _packed(_forward(path)),
         "times": _packed((stamps - place.stamps_ns[0]) * 1e-9),
         "pieces": _pieces(stamps),
@@ -110,6 +113,13 @@ def _landmarks(place: Scene, points: NDArray[np.float64] | None) -> NDArray[np.f
     near = np.linalg.norm(drawn - (low + high) / 2, axis=1) < SURROUNDINGS * radius
     drawn = drawn[near]
     return drawn[thin(len(drawn), LANDMARKS)]
+
+
+def _ends(place: Scene, loops: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    if loops is None:
+        return np.zeros((0, 3))
+    T = place.T_drawn_world
+    return np.asarray(loops.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])
 
 
 def _packed(values: ArrayLike) -> str:

@@ -17,6 +17,7 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from odomap.views.covisibility import MapView
+from odomap.views.loopplan import ENDS, draw_loops
 from odomap.views.scene import AXES, Scene, gaps_as_nan, thin
 from odomap.views.style import PALETTE, dress, legend, new_figure
 
@@ -78,8 +79,15 @@ def plan_figure(place: Scene, view: MapView, unit: str = "m") -> Figure:
     _window(ax, place, landmarks, axes)
     if place.up_sign < 0 and axes[1] == place.up_axis:
         ax.invert_yaxis()
+    flat = [_moved(place, ends.reshape(-1, 3))[:, axes] for ends in (view.loops, view.gaps)]
+    loops, gaps = (ends.reshape(-1, 2, 2) for ends in flat)
+    if len(gaps):
+        _strokes(ax, gaps, color=PALETTE["muted"], lw=1.0, ls=(0, (2, 3)), zorder=4)
+    draw_loops(ax, loops)
     drawn = len(dots) > 0, len(view.pairs) > 0, len(shown) > 0
-    legend(ax, handles=[*_key(view, *drawn), *ax.get_legend_handles_labels()[0]])
+    handles, labels = ax.get_legend_handles_labels()
+    named = [handle for handle, label in zip(handles, labels) if label not in ENDS]
+    legend(ax, handles=[*_key(view, *drawn), *named])
     return figure
 
 
@@ -90,6 +98,7 @@ def _key(view: MapView, landmarks: bool, pairs: bool, keyframes: bool) -> list[L
     entries: list[tuple[bool, str, dict[str, Any]]] = [
         (landmarks, "landmark", {**dot, "ms": 2.5, "color": PALETTE["muted"]}),
         (keyframes, "keyframe", {**dot, "ms": 4.0, "color": PALETTE["keyframe"]}),
+        (len(view.gaps) > 0, "not measured", {"lw": 1.0, "ls": ":", "color": PALETTE["muted"]}),
         (pairs, join, {"lw": 1.2, "color": PALETTE["good"], "alpha": ALPHAS[-1]}),
     ]
     return [Line2D([], [], label=label, **style) for is_drawn, label, style in entries if is_drawn]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from odomap.geometry.trajectory import Trajectory
 from odomap.views.frames import frame_figure
+from odomap.views.loopplan import ENDS, draw_loops
 from odomap.views.patherror import PathError, finite_part, sigmas
 from odomap.views.scene import AXES, Scene, gaps_as_nan, scene, thin, unit_of
 from odomap.views.style import (
@@ -51,6 +52,7 @@ def path_figure(
     truth: Trajectory | None = None,
     keyframe_stamps_ns: NDArray[np.int64] | None = None,
     unit: str = "m",
+    loops: NDArray[np.float64] | None = None,
 ) -> Figure:
     """Draw a path from above and from the side, coloured by its error where the truth is known.
 
@@ -59,6 +61,7 @@ def path_figure(
         truth: ground truth, onto which the path is laid as well as a rigid motion can.
         keyframe_stamps_ns: stamps of the keyframes, marked on the path.
         unit: what lengths are in; "units" where a path has no scale.
+        loops: (L, 2, 3) ends of loops that were closed, in the path's world.
     """
     place = scene(trajectory, truth)
     if place is None:
@@ -73,6 +76,9 @@ def path_figure(
     ):
         dress(ax, title, f"{AXES[axes[0]]} [{unit}]", f"{AXES[axes[1]]} [{unit}]")
         _draw_path(ax, place, axes, keyframe_stamps_ns)
+        if loops is not None:
+            T = place.T_drawn_world
+            draw_loops(ax, (loops @ T[:3, :3].T + T[:3, 3])[:, :, axes])
         ax.set_aspect("equal", adjustable="datalim")
         if axes[1] == up and place.up_sign < 0:
             ax.invert_yaxis()
@@ -81,7 +87,7 @@ def path_figure(
     handles, labels = above.get_legend_handles_labels()
     ends = [k for k, label in enumerate(labels) if label in ("start", "end")]
     # Shared between the panels, so that no legend runs into a title.
-    lines = [k for k in range(len(labels)) if k not in ends]
+    lines = [k for k in range(len(labels)) if k not in ends and labels[k] not in ENDS]
     for ax, chosen in ((above, lines), (side, ends)):
         legend(ax, handles=[handles[k] for k in chosen])
     return figure

@@ -20,6 +20,7 @@ from odomap.maps.estimate import Estimate, Status
 
 if TYPE_CHECKING:
     from odomap.views.covisibility import MapView
+    from odomap.views.loopview import LoopView
 
 __all__ = [
     "Growth",
@@ -124,6 +125,7 @@ class Report:
         growth: how the map and the memory grew, or None.
         mapping: what local mapping made and dropped, by name.
         beside_ms: what ran beside the frames: count, median, p95 and max by name.
+        loops: what was decided on loops; None where none were looked for.
     """
 
     title: str
@@ -147,6 +149,7 @@ class Report:
     growth: Growth | None = None
     beside_ms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mapping: Mapping[str, int] = field(default_factory=dict)
+    loops: "LoopView | None" = None
 
     @property
     def has_path(self) -> bool:

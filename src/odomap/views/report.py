@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from odomap.files.atomic import write_text
 from odomap.maps.estimate import Estimate
+from odomap.views.loopsection import loops_section
 from odomap.views.mapsection import map_section
 from odomap.views.page import details, image, page, section, swatch, table, text
 from odomap.views.record import Report, Sample, lost_runs, significant, verdict
@@ -55,6 +56,7 @@ def render_report(report: Report) -> str:
     """Render a report as the text of one HTML page."""
     parts = [
         ("path", "Path", _path(report)),
+        ("loops", "Loops", loops_section(report)),
         ("map", "Map", map_section(report)),
         ("error", "Error over time", _error(report)),
         ("features", "Tracked features", _features(report)),
@@ -65,7 +67,9 @@ def render_report(report: Report) -> str:
     ]
     shown = [(name, title, body) for name, title, body in parts if body]
     links = "\n".join(f'<a href="#{name}">{text(title)}</a>' for name, title, _ in shown)
-    sections = [section(*part, long=part[0] in ("frames", "problems", "run")) for part in shown]
+    sections = [
+        section(*part, long=part[0] in ("loops", "frames", "problems", "run")) for part in shown
+    ]
     body = "\n".join([_head(report), f'<nav aria-label="Sections">{links}</nav>', *sections])
     footer = f"<footer>Made by odomap {text(report.version)}.</footer>"
     return page(f"{report.title} · odomap", f"{body}\n{footer}", with_script=report.has_path)
@@ -90,10 +94,11 @@ def _path(report: Report) -> str:
     if place is None:
         return '<p class="note">There is no path to show: no frame was tracked.</p>'
     keyframes = np.array([e.stamp_ns for e in report.estimates if e.is_keyframe], np.int64)
+    loops = None if report.map is None else report.map.loops
     against = " against the true one" if place.truth is not None else ""
     label = f"The path{against}, from above and from the side"
     flat_view = figure_svg(
-        path_figure(report.trajectory, report.truth, keyframes, report.unit), label
+        path_figure(report.trajectory, report.truth, keyframes, report.unit, loops), label
     )
     caption = SCALES[report.scale] + (
         "The whole path is laid on the truth by the one rigid motion that fits best; "
@@ -102,6 +107,7 @@ def _path(report: Report) -> str:
         else "No ground truth: the path is shown in its own world frame."
     )
     coloured = place.distances is not None
+    ties = np.zeros((0, 2, 3)) if loops is None else loops
     return f"""<figure>{flat_view}<figcaption>{caption}</figcaption></figure>
 <h3>In three dimensions</h3>
 <div class="view">
@@ -112,19 +118,21 @@ browser with canvas.</canvas>
 <input id="path3d-time" type="range" min="0" max="0" value="0" aria-label="Position along the path">
 <output id="path3d-clock"></output></div>
 </div>
-{_legend3d(coloured, place.truth is not None, report.points is not None)}
+{_legend3d(coloured, place.truth is not None, report.points is not None, bool(len(ties)))}
 <p class="note">Drag to turn, shift-drag to move, wheel to zoom, double-click to reset.</p>
 <noscript><p class="note">The interactive view needs JavaScript; nothing is loaded.</p></noscript>
 <script type="application/json" id="path3d-data">\
-{path3d_data(place, keyframes, report.points, report.unit)}</script>"""
+{path3d_data(place, keyframes, report.points, report.unit, ties)}</script>"""
 
 
-def _legend3d(coloured: bool, has_truth: bool, has_points: bool) -> str:
+def _legend3d(coloured: bool, has_truth: bool, has_points: bool, has_loops: bool) -> str:
     estimate = '<i class="ramp"></i>' if coloured else '<i style="color:var(--estimate)"></i>'
     items = [f"{estimate}estimate{', little to much error' if coloured else ''}"]
     if has_truth:
         items.append('<i style="color:var(--truth)"></i>truth')
     items.append('<i class="dot" style="color:var(--keyframe)"></i>keyframe')
+    if has_loops:
+        items.append('<i class="loop"></i>loop: a place seen before')
     if has_points:
         items.append('<i class="dot" style="color:var(--muted)"></i>landmark')
     return '<ul class="legend">' + "".join(f"<li>{item}</li>" for item in items) + "</ul>"

@@ -39,6 +39,7 @@ PALETTE = {
     "keyframe": "#e69f00",
     "lost": "#d55e00",
     "good": "#009e73",
+    "loop": "#b3268c",
     "stage1": "#0173b3",
     "stage2": "#56b4e9",
     "stage3": "#019f74",

@@ -1,0 +1,133 @@
+"""The part of a report that shows loops: what they are, where they were, and what they did.
+
+Who never saw a loop should understand the picture; who looks for a false one, or for one that was
+missed, needs the numbers and the reasons. So the picture comes first, then the loops that were
+closed, then the candidates that came nearest to it, and all others folded away.
+"""
+
+import math
+from collections.abc import Sequence
+
+from odomap.files.loops import LoopLog, LoopRecord, nearest
+from odomap.views.loopview import LoopView
+from odomap.views.page import folded, table, text
+from odomap.views.record import Report, length, significant
+from odomap.views.scene import scene
+
+__all__ = ["loops_section"]
+
+FEW = 8
+"""Refused candidates that are shown at once."""
+MOST = 500
+"""Rows of a table at most."""
+WHAT = (
+    "A loop is a place that the camera saw before. Until it comes back there, small errors add up "
+    "unnoticed; there they show, and closing the loop moves the path so that both visits agree."
+)
+INLIERS = "Points of both visits that agree with one position of the two cameras"
+
+
+def loops_section(report: Report) -> str:
+    """Return the section as HTML; empty where no loops were looked for."""
+    view = report.loops
+    if view is None:
+        return ""
+    log = view.log
+    if not log.records:
+        return f'<p>No place looked like one seen before.</p><p class="note">{WHAT}</p>'
+    parts = [f'<p class="note">{WHAT}</p>', _plan(report, view)]
+    if log.closed:
+        parts.append(f"<h3>Closed</h3>{_closed(log, view.scale, report.unit)}")
+    if log.rejected:
+        parts.append(_rejected(log))
+    return "\n".join(filter(None, parts))
+
+
+def _plan(report: Report, view: LoopView) -> str:
+    place = scene(report.trajectory, report.truth)
+    if place is None or not view.log.closed or not len(view.live):
+        return "" if view.log.closed else "<p>No loop was closed.</p>"
+    from odomap.views.loopplan import loops_figure
+    from odomap.views.plan import plan_axes
+    from odomap.views.style import figure_svg
+
+    figure = loops_figure(place, view, plan_axes(place), report.unit)
+    svg = figure_svg(figure, "The path before and after its loops were closed")
+    caption = (
+        "On the left the path as it was tracked, until the last loop was found; on the right as it "
+        "is known at the end, with what it was before as a pale line. A dot is where the camera "
+        "came back, and a ring where it had been."
+    )
+    return (
+        f"<p>{text(_summary(view, report.unit))}</p>"
+        f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _summary(view: LoopView, unit: str) -> str:
+    """Say in a sentence what the loop that moved the path most did."""
+    log, n = view.log, view.largest
+    loop = log.closed[n]
+    count = "One loop was" if len(log.closed) == 1 else f"{len(log.closed)} loops were"
+    which = "" if len(log.closed) == 1 else f", most by loop {n + 1}"
+    back = f"at {log.seconds(loop.stamp_ns):.1f} s the camera was back where it had been"
+    when = (
+        "in the map before"
+        if loop.matched_frame < 0
+        else f"at {log.seconds(loop.matched_stamp_ns):.1f} s"
+    )
+    by = _length(view.scale * loop.moved, unit)
+    return f"{count} closed{which}: {back} {when}; the path moved by {by} there."
+
+
+def _length(metres: float, unit: str) -> str:
+    return length(metres) if unit == "m" else f"{significant(metres, 2)} {unit}"
+
+
+def _closed(log: LoopLog, scale: float, unit: str) -> str:
+    rows = []
+    for n, loop in enumerate(log.closed[:MOST], 1):
+        said = "two pieces of the map became one" if loop.merges else ""
+        moved = _length(scale * loop.moved, unit), f"{math.degrees(loop.turned):.2g}°"
+        rescaled = [] if log.is_metric else [f"{100.0 * (loop.rescaled - 1.0):+.1f} %"]
+        cells = [f"{loop.num_inliers:,}", *moved, *rescaled, said]
+        rows.append([str(n), *_ends(log, loop), *map(text, cells)])
+    head = ["", "Back at", "had been there at", _inliers(), "path moved", "turned"]
+    head += [] if log.is_metric else ["rescaled"]
+    return table([*head, ""], rows, numbers=range(3, len(head)))
+
+
+def _rejected(log: LoopLog) -> str:
+    """Return the refused candidates: the nearest to it at once, the others folded."""
+    refused = log.rejected
+    near = nearest(refused, FEW)
+    note = (
+        "Places that looked like one seen before, but did not agree in geometry, or not with the "
+        "path. "
+    )
+    title = f"<h3>Refused ({len(refused):,})</h3>"
+    if len(refused) <= FEW:
+        return f'{title}<p class="note">{note}</p>{_reasons(log, refused)}'
+    note += f"Those {FEW} with the most inliers:"
+    hidden = len(refused) - MOST
+    more = f'<p class="note">… and {hidden} more, in loops.json.</p>' if hidden > 0 else ""
+    everything = folded(f"All {len(refused):,}", _reasons(log, refused[:MOST]) + more)
+    return f'{title}<p class="note">{note}</p>{_reasons(log, near)}{everything}'
+
+
+def _reasons(log: LoopLog, records: Sequence[LoopRecord]) -> str:
+    rows = [[*_ends(log, r), f"{r.num_inliers:,}", text(r.reason)] for r in records]
+    return table(["Came by at", "looked like", _inliers(), "Why not"], rows, numbers=[2])
+
+
+def _inliers() -> str:
+    return f'<abbr title="{text(INLIERS)}">inliers</abbr>'
+
+
+def _ends(log: LoopLog, loop: LoopRecord) -> list[str]:
+    """Return when the camera came back, and when it had been there."""
+    back = f"{log.seconds(loop.stamp_ns):.2f} s (frame {loop.frame})"
+    if loop.matched_frame < 0:
+        return [text(back), text(f"keyframe {loop.matched_id} of the map before")]
+    there = f"{log.seconds(loop.matched_stamp_ns):.2f} s (frame {loop.matched_frame})"
+    return [text(back), text(there)]
