@@ -6,6 +6,7 @@ import pytest
 from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.maps.states import stretched
 from odomap.system.path import Path, Placed
 
 
@@ -87,6 +88,57 @@ def test_the_covariance_is_that_of_samples(map):
     claimed = Path(map).covariance(Placed(150, 2, pose(7), covariance(7, 0.003)))
     scale = np.sqrt(np.outer(np.diag(claimed), np.diag(claimed)))
     assert np.abs((sampled - claimed) / scale).max() < 0.03
+
+
+def stretch(map, units):
+    """Have keyframe 1 count in other units, as a loop that corrects the scale does."""
+    snapshot = map.snapshot([1], [0], landmarks=False)
+    scales = np.where(snapshot.keyframe_ids == 1, units, snapshot.scales)
+    map.apply(snapshot.solved(snapshot.Ts_world_body, np.zeros((0, 3)), scales=scales))
+
+
+@pytest.mark.parametrize("units", [1.0, 0.4, 3.0])
+def test_a_frame_is_hung_where_it_is_and_as_sure_as_it_is_in_whatever_units(map, units):
+    path, straight = Path(map), Path(map)
+    T, own = pose(7), covariance(7)
+    _, expected = straight.append(straight.hang(150, 1, T, own))
+    sure = map.covariance(1)
+    stretch(map, units)
+    map.set_covariance([1], sure)
+    frame = path.hang(150, 1, T, own)
+    found, covariances = path.append(frame)
+    np.testing.assert_allclose(found, T, atol=1e-12)
+    np.testing.assert_allclose(covariances, expected, rtol=1e-9, atol=1e-15)
+    away = np.linalg.norm(T[:3, 3] - map.T_world_body(1)[:3, 3])
+    assert units * np.linalg.norm(frame.T_keyframe_body[:3, 3]) == pytest.approx(away)
+
+
+def test_a_frame_is_stretched_with_its_keyframe_and_so_is_how_unsure_it_is(map):
+    path = Path(map)
+    T, before = path.append(path.hang(150, 1, pose(7), covariance(7)))
+    stretch(map, 2.0)
+    step = path.last_pose()[:3, 3] - map.T_world_body(1)[:3, 3]
+    np.testing.assert_allclose(step, 2.0 * (T[:3, 3] - map.T_world_body(1)[:3, 3]))
+    np.testing.assert_allclose(path.last_covariance(), stretched(before, 2.0), rtol=1e-9)
+
+
+def test_how_fast_a_body_has_moved_is_told_in_the_units_of_now(map):
+    path = Path(map)
+    for n in range(4):
+        T = map.T_world_body(1) @ se3_exp(np.array([0.01 * n, 0, 0, 0, 0, 0]))
+        path.append(path.hang(150 + n, 1, T, 1e-10 * np.eye(6)))
+    further = path.last_pose() @ se3_exp(np.array([0.05, 0, 0, 0, 0, 0]))
+    assert path.is_leap(path.last_pose(), further, 1e-10 * np.eye(6))
+    stretch(map, 2.0)
+    further = path.last_pose() @ se3_exp(np.array([0.05, 0, 0, 0, 0, 0]))
+    assert not path.is_leap(path.last_pose(), further, 1e-10 * np.eye(6))
+    # A keyframe that is new has the units of the world, and the body is no faster for that.
+    m = map
+    m.add_keyframe(Keyframe(m.new_keyframe_id(), 153), path.last_pose(), parent=1)
+    path.replace_last(Placed(153, 3, np.eye(4), np.zeros((6, 6))))
+    assert not path.is_leap(path.last_pose(), further, 1e-10 * np.eye(6))
+    further = path.last_pose() @ se3_exp(np.array([0.07, 0, 0, 0, 0, 0]))
+    assert path.is_leap(path.last_pose(), further, 1e-10 * np.eye(6))
 
 
 def test_velocity_is_the_twist_per_second(map):
