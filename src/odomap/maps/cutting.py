@@ -32,7 +32,8 @@ class Cut:
         placements: (n, 4, 4) poses and (n,) scales.
         slots: (m,) slots of the landmarks that free keyframes see, ascending.
         landmark_ids: (m,) their ids.
-        anchors: (m, 4, 4) poses and (m,) scales of their anchors.
+        anchor_ids: (m,) their anchors.
+        anchors: (m, 4, 4) poses and (m,) scales of these.
         p_anchor: (m, 3) places in these.
         indptr: (n + 1,) observations of each keyframe, or (1,) where none are wanted.
         obs_slot: (o,) slots of what is seen.
@@ -47,6 +48,7 @@ class Cut:
     placements: Placement
     slots: NDArray[np.int64]
     landmark_ids: NDArray[np.int64]
+    anchor_ids: NDArray[np.int64]
     anchors: Placement
     p_anchor: NDArray[np.float64]
     indptr: NDArray[np.int64]
@@ -71,6 +73,8 @@ def snapshot_from(cut: Cut) -> Snapshot:
         scales=scales,
         landmark_ids=cut.landmark_ids,
         points_world=act(cut.anchors, cut.p_anchor),
+        anchors=cut.anchor_ids,
+        points_anchor=cut.p_anchor,
         obs_keyframe=keyframe[used],
         obs_landmark=landmark[used],
         obs_keypoint=cut.obs_keypoint[used].astype(np.int64),

@@ -272,6 +272,7 @@ class Map(Surroundings):
             placements=self.states.placements(ids),
             slots=slots,
             landmark_ids=self._landmarks.ids[slots],
+            anchor_ids=anchors,
             anchors=self.states.placements(anchors),
             p_anchor=self._landmarks.p_anchor.take(slots),
             indptr=indptr,
@@ -294,6 +295,32 @@ class Map(Surroundings):
             writing.move_keyframes(self._tree, self.states, update, C)
             writing.move_landmarks(self._landmarks, self.states, update, C)
             writing.drop_observations(self._observations, self._landmarks, update)
+            self.version += 1
+            self.epoch += 1
+
+    def settle(
+        self,
+        landmark_ids: ArrayLike,
+        anchors: NDArray[np.int64],
+        before: NDArray[np.float64],
+        after: NDArray[np.float64],
+    ) -> None:
+        """Move landmarks within their anchors, but for those that were moved by others meanwhile.
+
+        Args:
+            landmark_ids: (n,) landmarks.
+            anchors: (n,) keyframes they were stored relative to when they were read.
+            before: (n, 3) their places in these then, as `Snapshot.points_anchor` tells.
+            after: (n, 3) their places in these from now on.
+        """
+        with self.lock:
+            slots = self._landmarks.slots(self._ids(landmark_ids))
+            rows = np.flatnonzero(slots >= 0)
+            slots = slots[rows]
+            landmarks = self._landmarks
+            as_read = (landmarks.p_anchor.take(slots) == before[rows]).all(axis=1)
+            as_read &= landmarks.anchor.take(slots) == anchors[rows]
+            landmarks.p_anchor[slots[as_read]] = after[rows[as_read]]
             self.version += 1
             self.epoch += 1
 

@@ -125,6 +125,8 @@ class Snapshot:
         scales: (n,) world units per unit of the keyframe.
         landmark_ids: (m,) landmarks seen by at least one free keyframe.
         points_world: (m, 3) their places.
+        anchors: (m,) keyframes they are stored relative to, by id.
+        points_anchor: (m, 3) their places in these, in their units.
         obs_keyframe: (o,) index into keyframe_ids, ascending.
         obs_landmark: (o,) index into landmark_ids.
         obs_keypoint: (o,) index into the keyframe's features.
@@ -140,6 +142,8 @@ class Snapshot:
     scales: NDArray[np.float64]
     landmark_ids: NDArray[np.int64]
     points_world: NDArray[np.float64]
+    anchors: NDArray[np.int64]
+    points_anchor: NDArray[np.float64]
     obs_keyframe: NDArray[np.int64]
     obs_landmark: NDArray[np.int64]
     obs_keypoint: NDArray[np.int64]

@@ -7,9 +7,10 @@ what lies between, `Job.solve` on arrays that are its own, runs beside the frame
     between frames     start (add reads) ──────── frames ────────▶ collect, change.write
     stage's thread              └──── solve: compiled, without the GIL ────┘
 
-When to collect is all that the rhythms differ in. Python hands its lock from thread to thread every
-5 ms at best; while threads run, that is shortened, or a tracker made of many short steps would wait
-for it at each (`quick_switching`).
+When to collect is all that the rhythms differ in. One stage stands aside (`Sideline`): its jobs
+take long, and are given up where another one is begun. Python hands its lock from thread to thread
+every 5 ms at best; while threads run, that is shortened, or a tracker made of many short steps
+would wait for it at each (`quick_switching`).
 
 Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR workspaces, 2007.
 """
@@ -17,15 +18,15 @@ Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR works
 import sys
 import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from odomap.limits import Count, Limits, check_limits
 from odomap.maps.keyframes import Keyframe
-from odomap.system.stages import Change, Closer, Job, Mapper
+from odomap.system.stages import Adjuster, Change, Closer, Job, LongChange, LongJob, Mapper
 
-__all__ = ["Lane", "QuickSwitching", "ThreadConfig"]
+__all__ = ["Lane", "QuickSwitching", "Sideline", "ThreadConfig"]
 
 Frames = Annotated[int, Limits(least=0)]
 
@@ -39,6 +40,9 @@ class ThreadConfig:
     next frame does, and the mapper works while it is read; 0 works inline."""
     closing_delay: Frames = 20
     """Lockstep: frames from the search for a loop to the one that sees the path corrected."""
+    adjusting_pace: Frames = 2000
+    """Lockstep: observations adjusted in the time of a frame, so that a large map is seen adjusted
+    later than a small one, and none before `closing_delay`; 0 works inline."""
     queue: Count = 2
     """Live: frames that may wait for the tracker; beyond them the oldest is dropped."""
     messages: Count = 256
@@ -163,6 +167,97 @@ class Lane:
     def close(self) -> None:
         """End the thread and forget the job that is out; a later start makes a new one."""
         self.keyframe, self._future = None, None
+        if self._thread is not None:
+            self._thread.shutdown(wait=True)
+            self._thread = None
+
+
+class Sideline:
+    """A stage aside of all others, whose job is given up where another one is begun.
+
+    Args:
+        name: for timing and for the thread.
+        stage: the adjuster.
+
+    Attributes:
+        name: of the line.
+        solved_ms: milliseconds that the last job was solved in.
+    """
+
+    def __init__(self, name: str, stage: Adjuster) -> None:
+        self.name, self._stage = name, stage
+        self.solved_ms = 0.0
+        self._future: Future[LongChange] | None = None
+        self._stop = threading.Event()
+        self._thread: ThreadPoolExecutor | None = None
+
+    @property
+    def is_out(self) -> bool:
+        """Whether a job is out."""
+        return self._future is not None
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether a job is out whose change, or whose error, is there."""
+        return self._future is not None and self._future.done()
+
+    def start(self, keyframe: Keyframe, reads_beside: bool) -> int:
+        """Begin a job, in place of the one that is out.
+
+        Args:
+            keyframe: where a loop was closed.
+            reads_beside: whether the map is copied in the stage's thread too, while it goes on.
+
+        Returns:
+            The size of the job; 0 where there is nothing to do, or it is not known yet.
+        """
+        self.drop()
+        job = self._stage.add(keyframe)
+        if job is None:
+            return 0
+        if not reads_beside:
+            job.read()
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
+        self._stop = threading.Event()
+        self._future = self._thread.submit(self._solve, job, self._stop, reads_beside)
+        return job.size if not reads_beside else 0
+
+    def _solve(self, job: LongJob, stop: threading.Event, reads: bool) -> LongChange:
+        start = time.perf_counter()
+        if reads:
+            job.read()
+        change = job.solve(stop)
+        self.solved_ms = 1e3 * (time.perf_counter() - start)
+        return change
+
+    def wait(self, seconds: float) -> None:
+        """Wait for the job that is out, but no longer than that."""
+        if self._future is not None:
+            wait([self._future], seconds)
+
+    def collect(self) -> LongChange:
+        """Wait for the job that is out, and return its change.
+
+        Raises:
+            Exception: what the stage raised; the job is not out any more.
+        """
+        assert self._future is not None, f"{self.name}: no job is out"
+        future = self._future
+        try:
+            return future.result()
+        finally:
+            if future.done():
+                self._future = None
+
+    def drop(self) -> None:
+        """Give up the job that is out: nobody will learn what it found, and it ends soon."""
+        self._stop.set()
+        self._future = None
+
+    def close(self) -> None:
+        """End the thread, and give up the job that is out; a later start makes a new one."""
+        self.drop()
         if self._thread is not None:
             self._thread.shutdown(wait=True)
             self._thread = None

@@ -30,6 +30,7 @@ from odomap.maps.edges import LOOP
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import compose, inverse, stretched
+from odomap.system.correction import correction
 from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
@@ -178,27 +179,10 @@ class Closure:
     def _update(self, map: Map) -> Update:
         """Return the correction, applied to where keyframes are now."""
         before, after = self.before, self.after
-        now = map.snapshot(before.keyframe_ids, landmarks=False)
-        row = np.searchsorted(before.keyframe_ids, now.keyframe_ids)
-        Ts, scales = after.Ts_world_body[row], after.scales[row]
-        is_as_read = (now.Ts_world_body == before.Ts_world_body[row]).all(axis=(1, 2))
-        other = np.flatnonzero(~(is_as_read & (now.scales == before.scales[row])))
-        read = before.Ts_world_body[row[other]], before.scales[row[other]]
-        moved = compose((Ts[other], scales[other]), inverse(read))
-        Ts[other], scales[other] = compose(moved, (now.Ts_world_body[other], now.scales[other]))
+        read, solved = ((side.Ts_world_body, side.scales) for side in (before, after))
         root = int(before.keyframe_ids[before.root])
-        return Update(
-            anchor_id=root,
-            T_world_anchor=map.T_world_body(root),
-            keyframe_ids=now.keyframe_ids,
-            Ts_world_body=Ts,
-            landmark_ids=np.zeros(0, np.int64),
-            points_world=np.zeros((0, 3)),
-            version=before.version,
-            scales=scales,
-            scale_anchor=map.scale(root),
-            covariances=None if after.covariances is None else after.covariances[row],
-        )
+        ids, version = before.keyframe_ids, before.version
+        return correction(map, ids, read, solved, root, version, after.covariances)
 
 
 def _fuse(map: Map, newer: int, matched: int, found: Verified) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleConfig
 from odomap.errors import CalibrationError, ConfigError, nearest_name
 from odomap.sensors.rig import Rig
+from odomap.system.adjusting import AdjustingConfig
 from odomap.system.association import (
     Association,
     FeatureAssociation,
@@ -91,6 +92,8 @@ class Config:
     """By which words places are recognised."""
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """When loops are looked for, and closed."""
+    adjusting: AdjustingConfig = field(default_factory=AdjustingConfig)
+    """How the whole map is adjusted after that."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
-from odomap.system.background import ThreadConfig
+from odomap.system.background import Sideline, ThreadConfig
 from odomap.system.feed import LOOK_UP_S, Feed, Mailbox
 from odomap.system.parallel import ParallelWorker
 from odomap.system.stages import Stages
@@ -59,6 +59,7 @@ class LiveWorker(ParallelWorker):
             source: frames in order of time; a recording comes at the pace of its stamps.
             interrupt: set where no more are wanted, though one is being waited for.
         """
+        self._interrupt = interrupt
         self._switching.hold()
         self._feed = Feed(source, self._config.queue, self._drop)
         try:
@@ -84,6 +85,13 @@ class LiveWorker(ParallelWorker):
 
     def _is_due(self, index: int) -> bool:
         return self._lanes[index].is_solved
+
+    def _is_adjusted(self) -> bool:
+        return self._adjusting is not None and self._adjusting.is_solved
+
+    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+        """Begin to adjust the whole map; it is copied beside the frames, in steps."""
+        adjusting.start(keyframe, reads_beside=True)
 
     def _hand(self, index: int, keyframe: Keyframe) -> None:
         """Give a keyframe to a stage; if it is busy it waits, in place of an older one."""

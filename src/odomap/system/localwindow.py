@@ -110,5 +110,7 @@ def by_id(snapshot: Snapshot) -> Snapshot:
         snapshot,
         landmark_ids=snapshot.landmark_ids[order],
         points_world=snapshot.points_world[order],
+        anchors=snapshot.anchors[order],
+        points_anchor=snapshot.points_anchor[order],
         obs_landmark=row[snapshot.obs_landmark],
     )

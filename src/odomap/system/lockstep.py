@@ -15,6 +15,9 @@ one job out at most: where a keyframe comes before d frames are over, the change
 written first, so that `add` reads a map which is known. The closer is given a keyframe when the
 mapper has written what it found.
 
+What takes a time that grows with the map (`Sideline`) has a delay that grows with the number of its
+observations. Given up or not is a question of what was closed meanwhile, never of how far it came.
+
 Observers are called in the caller's thread. Timing per frame includes the waiting.
 
 Reference: none in print; the idea is that of the synchronous languages (Benveniste, Berry, "The
@@ -22,7 +25,7 @@ synchronous approach to reactive and real-time systems", 1991): a delay is a num
 """
 
 from odomap.maps.keyframes import Keyframe
-from odomap.system.background import ThreadConfig
+from odomap.system.background import Sideline, ThreadConfig
 from odomap.system.parallel import ParallelWorker
 from odomap.system.stages import Stages
 
@@ -42,7 +45,9 @@ class LockstepWorker(ParallelWorker):
         config = ThreadConfig() if config is None else config
         delays = {"map": config.mapping_delay, "close": config.closing_delay}
         self._delays = [delays[lane.name] for lane in self._lanes]
+        self._closing_delay, self._pace = config.closing_delay, config.adjusting_pace
         self._due = [0] * len(self._lanes)
+        self._adjusted = 0
         self._count = 0
 
     def _write_due(self) -> None:
@@ -63,3 +68,16 @@ class LockstepWorker(ParallelWorker):
         self._due[index] = self._count + self._delays[index]
         if self._lanes[index].is_out and self._delays[index] == 0:
             self._collect(index)
+
+    def _is_adjusted(self) -> bool:
+        return self._adjusted <= self._count
+
+    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+        """Begin to adjust the whole map as it is now."""
+        size = adjusting.start(keyframe, reads_beside=False)
+        if self._pace:
+            delay = max(-(-size // self._pace), self._closing_delay)
+            self._adjusted = self._count + delay
+        elif adjusting.is_out:
+            self._collect_adjusted()
+            self._write_parts()

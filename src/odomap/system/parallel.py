@@ -16,11 +16,15 @@ by then, and the next image is made ready meanwhile:
     between frames              └ make keyframe, add;  write what is due ┘
     stage's thread                                └──── solve ────────────────────────▶
 
+Where a loop was closed the whole map is adjusted, aside of the others (`Sideline`). That is written
+part by part, one before each frame; another loop closed meanwhile begins it anew.
+
 Observers are told in the order of events, when the map is the tracker's again.
 """
 
 import time
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,20 +33,26 @@ from dataclasses import replace
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
-from odomap.system.background import Lane, QuickSwitching
-from odomap.system.stages import Loop, Stages
-from odomap.system.worker import Worker
+from odomap.system.background import Lane, QuickSwitching, Sideline
+from odomap.system.stages import Change, Loop, Stages, has_closed
+from odomap.system.worker import Worker, deferred_interrupt
 
 __all__ = ["ParallelWorker"]
 
+LOOK_UP_S = 0.1
+"""How often `finish` looks up from what takes long, whether Ctrl-C was pressed."""
+
 
 class ParallelWorker(Worker):
-    """Tracks in the caller's thread, and has mapper and closer work beside it."""
+    """Tracks in the caller's thread, and has mapper, closer and adjuster work beside it."""
 
     def __init__(self, stages: Stages) -> None:
         super().__init__(stages)
         named = ("map", stages.mapper), ("close", stages.closer)
         self._lanes = [Lane(name, stage) for name, stage in named if stage is not None]
+        adjuster = stages.adjuster
+        self._adjusting = None if adjuster is None else Sideline("adjust", adjuster)
+        self._parts: deque[Change] = deque()
         self._switching = QuickSwitching()
         self._between: ThreadPoolExecutor | None = None
         self._lent: list[Future[None]] = []
@@ -51,6 +61,14 @@ class ParallelWorker(Worker):
     @abstractmethod
     def _is_due(self, index: int) -> bool:
         """Say whether the change of a job that is out is to be written before the next frame."""
+
+    @abstractmethod
+    def _is_adjusted(self) -> bool:
+        """Say whether the map adjusted is to be written from the next frame on."""
+
+    @abstractmethod
+    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+        """Begin to adjust the whole map, in place of what is being adjusted."""
 
     @abstractmethod
     def _hand(self, index: int, keyframe: Keyframe) -> None:
@@ -71,19 +89,38 @@ class ParallelWorker(Worker):
         return replace(estimate, timing={**estimate.timing, "wait": waited})
 
     def finish(self) -> None:
-        """Write all that is out, stage after stage, and end the threads."""
+        """Write all that is out, stage after stage, and end the threads.
+
+        After Ctrl-C, also if it is pressed while this waits, the map is not adjusted any further.
+        """
         try:
             self._lend(self._write_all)
+            self._take_back()
+            with deferred_interrupt() as interrupt:
+                while self._adjusting is not None and self._adjusting.is_out:
+                    if interrupt.is_set() or self._interrupt.is_set():
+                        self._adjusting.drop()
+                    elif self._adjusting.is_solved:
+                        self._lend(self._collect_adjusted)
+                        self._take_back()
+                    else:
+                        self._adjusting.wait(LOOK_UP_S)
+            self._lend(self._write_parts)
             self._take_back()
         finally:
             self.close()
 
     def close(self) -> None:
         """End the threads; a job that is out is lost, unless `finish` wrote it."""
+        if self._adjusting is not None:
+            self._adjusting.drop()  # somebody may be waiting for it
         if self._between is not None:
             self._between.shutdown(wait=True, cancel_futures=True)
             self._between = None
         self._lent.clear()
+        self._parts.clear()
+        if self._adjusting is not None:
+            self._adjusting.close()
         for lane in self._lanes:
             lane.close()
         self._switching.release()
@@ -123,6 +160,10 @@ class ParallelWorker(Worker):
         for index, lane in enumerate(self._lanes):
             if lane.is_out and self._is_due(index):
                 self._collect(index)
+        if self._adjusting is not None and self._adjusting.is_out and self._is_adjusted():
+            self._collect_adjusted()
+        if self._parts:
+            self._write_part()
 
     def _write_all(self) -> None:
         for index, lane in enumerate(self._lanes):
@@ -154,7 +195,27 @@ class ParallelWorker(Worker):
         with self._beside(f"{lane.name} writes"):
             change.write(self.stages.map)
         self._news.extend(change.loops)
+        if has_closed(change) and self._adjusting is not None:
+            self._parts.clear()  # what was adjusted was another path
+            with self._beside("adjust reads"):
+                self._adjust(self._adjusting, keyframe)
         self._hand(index + 1, keyframe)
+
+    # ---- the whole map ----
+
+    def _collect_adjusted(self) -> None:
+        """Wait until the map is adjusted, and lay ready what is to be written."""
+        assert self._adjusting is not None
+        self._parts.extend(self._adjusting.collect().parts())
+        self._note("adjust solves", self._adjusting.solved_ms)
+
+    def _write_part(self) -> None:
+        with self._beside("adjust writes"):
+            self._parts.popleft().write(self.stages.map)
+
+    def _write_parts(self) -> None:
+        while self._parts:
+            self._write_part()
 
     @contextmanager
     def _beside(self, name: str) -> Iterator[None]:

@@ -23,6 +23,7 @@ from odomap.files.vocabulary import Vocabulary
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config, make_association, preset, preset_for
+from odomap.system.depthbias import DepthBias
 from odomap.system.keyframetracking import KeyframeTracker
 from odomap.system.keyframing import Keyframes
 from odomap.system.localmapping import LocalMapper, MappingSections
@@ -31,7 +32,7 @@ from odomap.system.maptracking import MapTracker
 from odomap.system.path import Path
 from odomap.system.recognisedstart import RecognisedStart
 from odomap.system.recognition import Recognizer
-from odomap.system.stages import Closer, Stages
+from odomap.system.stages import Adjuster, Closer, Stages
 from odomap.system.starting import make_start
 from odomap.system.visual import Sight, VisualSystem
 from odomap.vision.vocabulary import VocabularyTree
@@ -113,8 +114,13 @@ class Slam(VisualSystem):
         )
         if not self._is_mapping:
             return Stages(self.map, self._tracker)
-        closer = self._closer(sight, sections, config) if config.closing.enabled else None
-        return Stages(self.map, self._tracker, self._mapper, closer)
+        if not config.closing.enabled:
+            return Stages(self.map, self._tracker, self._mapper)
+        closer = self._closer(sight, sections, config)
+        adjuster = (
+            self._adjuster(sight, sections, config, bias) if config.adjusting.enabled else None
+        )
+        return Stages(self.map, self._tracker, self._mapper, closer, adjuster)
 
     def _closer(self, sight: Sight, sections: MappingSections, config: Config) -> Closer:
         from odomap.system.closing import LoopCloser, SideVerifier  # what compiles pose graphs
@@ -130,6 +136,24 @@ class Slam(VisualSystem):
         )
         search, forget = LoopSearch(self._words, config.closing), self._mapper.forget_drifts
         return LoopCloser(self.map, search, verifier, with_scale, config.closing, forget)
+
+    def _adjuster(
+        self, sight: Sight, sections: MappingSections, config: Config, bias: DepthBias
+    ) -> Adjuster:
+        from odomap.system.globaladjustment import GlobalAdjuster  # what compiles large bundles
+
+        return GlobalAdjuster(
+            self.map,
+            sight.eye.camera,
+            sight.eye.T_body_camera,
+            sections.sigma_px,
+            sections.level_scale,
+            1.0 if sight.ranger is None else sight.ranger.sigma,
+            bias,
+            sections.mapping.gate,
+            sections.bundle,
+            config.adjusting,
+        )
 
     @property
     def _path(self) -> Path:

@@ -1,10 +1,12 @@
-"""Stages: the faces of tracker, mapper and closer, blind to threads.
+"""Stages: the faces of tracker, mapper, closer and adjuster, blind to threads.
 
-A run is a chain of three agents over one map. The tracker places every frame; the mapper improves
-the map around each new keyframe; the closer looks for places seen before and corrects the path:
+A run is a chain of agents over one map. The tracker places every frame; the mapper improves the map
+around each new keyframe; the closer looks for places seen before and corrects the path; where it
+did, the adjuster brings the whole map into agreement:
 
     frame → Tracker.prepare, track → Estimate;  Tracker.make_keyframe → keyframe
     keyframe → Mapper.add → Job → Change;       keyframe → Closer.add → Job → Change
+    accepted loop → Adjuster.add → LongJob → LongChange
 
 Tracking must not wait for what takes long, so the work of mapper and closer comes in three parts:
 `add` reads the map (a snapshot: short), `Job.solve` works on what was read and touches the map no
@@ -28,7 +30,22 @@ from odomap.maps.map import Map
 from odomap.maps.snapshot import Update
 from odomap.sensors.frame import Frame
 
-__all__ = ["Change", "Closer", "Job", "Loop", "MapState", "Mapper", "Solved", "Stages", "Tracker"]
+__all__ = [
+    "Adjuster",
+    "Change",
+    "Closer",
+    "Job",
+    "LongChange",
+    "LongJob",
+    "Loop",
+    "MapState",
+    "Mapper",
+    "Solved",
+    "Stages",
+    "Stop",
+    "Tracker",
+    "has_closed",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +116,42 @@ class Job(Protocol):
         ...
 
 
+class Stop(Protocol):
+    """Says that what is being done is not wanted any more, such as a `threading.Event`."""
+
+    def is_set(self) -> bool:
+        """Say so."""
+        ...
+
+
+class LongChange(Change, Protocol):
+    """A change of the whole map, too large to be written between two frames."""
+
+    def parts(self) -> tuple[Change, ...]:
+        """Cut it into changes that are short, after each of which the map is whole.
+
+        Each is written before another frame, and those that are left may never be.
+        """
+        ...
+
+
+class LongJob(Protocol):
+    """A piece of work on the whole map, which may be given up."""
+
+    @property
+    def size(self) -> int:
+        """How much there is to do, in observations; known when it has been read."""
+        ...
+
+    def read(self) -> None:
+        """Copy what is needed of the map, which others may change meanwhile; before `solve`."""
+        ...
+
+    def solve(self, stop: Stop | None = None) -> LongChange:
+        """Do it, without touching the map; once it is stopped, soon return a change of no parts."""
+        ...
+
+
 P = TypeVar("P")
 
 
@@ -134,6 +187,17 @@ class Closer(Protocol):
         ...
 
 
+class Adjuster(Protocol):
+    """Adjusts the whole map."""
+
+    def add(self, keyframe: Keyframe) -> LongJob | None:
+        """Begin, after a loop was closed at this keyframe; None if there is nothing to do.
+
+        A job that is out is given up.
+        """
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Solved:
     """A change made of solutions: `Update`s to apply in order.
@@ -161,9 +225,16 @@ class Stages:
         tracker: places frames.
         mapper: improves the map; None where the tracker is all there is.
         closer: closes loops; None where nobody looks for them.
+        adjuster: adjusts the whole map after that; None where nobody does.
     """
 
     map: Map
     tracker: Tracker[Any]
     mapper: Mapper | None = None
     closer: Closer | None = None
+    adjuster: Adjuster | None = None
+
+
+def has_closed(change: Change) -> bool:
+    """Say whether the map was corrected by a loop."""
+    return any(loop.is_accepted for loop in change.loops)

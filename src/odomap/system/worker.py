@@ -2,7 +2,7 @@
 
 A rhythm is a class; stages, map and observers are the same in all of them (`rhythms` names them).
 
-    inline    each stage in turn: frame, then mapping, then closing; the same bytes on every run
+    inline    each stage in turn: frame, mapping, closing, adjusting; the same bytes on every run
     lockstep  mapping beside tracking, its result due a fixed number of frames later; the same bytes
     live      mapping beside tracking, as fast as it goes; frames that come too fast are dropped
 
@@ -31,7 +31,7 @@ from typing import TypeVar
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
-from odomap.system.stages import Loop, MapState, Stages
+from odomap.system.stages import Closer, Loop, Mapper, MapState, Stages, has_closed
 
 __all__ = [
     "InlineWorker",
@@ -86,6 +86,7 @@ class Worker(ABC):
         self.frames_dropped = self.jobs_skipped = self.messages_dropped = 0
         self.beside_ms: dict[str, list[float]] = {}
         self._told_version = stages.map.version
+        self._interrupt = threading.Event()
 
     @abstractmethod
     def advance(self, frame: Frame) -> Estimate:
@@ -117,6 +118,7 @@ class Worker(ABC):
             source: frames in order of time.
             interrupt: set where no more are wanted, though one is being waited for.
         """
+        self._interrupt = interrupt
         yield from source
 
     def track(self, frame: Frame) -> Estimate:
@@ -131,9 +133,9 @@ class Worker(ABC):
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed meanwhile; the frame is done all the same.
         """
-        with deferred_interrupt() as interrupt:
+        with deferred_interrupt() as self._interrupt:
             estimate = self.advance(frame)
-        if interrupt.is_set():
+        if self._interrupt.is_set():
             raise KeyboardInterrupt
         return estimate
 
@@ -195,19 +197,38 @@ class InlineWorker(Worker):
             timing = dict(estimate.timing)
             timing["keyframe"] = timing.get("keyframe", 0.0) + 1e3 * (time.perf_counter() - start)
             self._tell("on_keyframe", self.on_keyframe, keyframe)
-            for name, stage in (("map", self.stages.mapper), ("close", self.stages.closer)):
-                start = time.perf_counter()
-                job = stage.add(keyframe) if stage is not None else None
-                if job is None:
-                    continue
-                change = job.solve()
-                change.write(self.stages.map)
-                for loop in change.loops:
-                    self._tell("on_loop", self.on_loop, loop)
-                timing[name] = 1e3 * (time.perf_counter() - start)
+            self._work("map", self.stages.mapper, keyframe, timing)
+            if self._work("close", self.stages.closer, keyframe, timing):
+                self._adjust(keyframe, timing)
             estimate = replace(estimate, timing=timing)
         self._tell_map()
         return estimate
+
+    def _work(
+        self, name: str, stage: Mapper | Closer | None, keyframe: Keyframe, timing: dict[str, float]
+    ) -> bool:
+        """Have a stage do what there is to do for a keyframe; say whether a loop was closed."""
+        start = time.perf_counter()
+        job = stage.add(keyframe) if stage is not None else None
+        if job is None:
+            return False
+        change = job.solve()
+        change.write(self.stages.map)
+        for loop in change.loops:
+            self._tell("on_loop", self.on_loop, loop)
+        timing[name] = 1e3 * (time.perf_counter() - start)
+        return has_closed(change)
+
+    def _adjust(self, keyframe: Keyframe, timing: dict[str, float]) -> None:
+        """Adjust the whole map, unless Ctrl-C is pressed."""
+        adjuster = self.stages.adjuster
+        start = time.perf_counter()
+        job = adjuster.add(keyframe) if adjuster is not None else None
+        if job is None:
+            return
+        job.read()
+        job.solve(self._interrupt).write(self.stages.map)
+        timing["adjust"] = 1e3 * (time.perf_counter() - start)
 
     def finish(self) -> None:
         """Do nothing but tell the last of the map: inline, every stage is at rest after a frame."""
