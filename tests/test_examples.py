@@ -123,6 +123,14 @@ def test_solution_of_exercise_1(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_solution_of_exercise_2(tmp_path):
+    picture = tmp_path / "places.png"
+    training = "sim:room?seed=11&frames=20&sensors=mono&speed=16"
+    recalls = main_of("exercise_2_solution.py")(training=training, picture=str(picture))
+    assert recalls["10^2"] < 0.5 < recalls["10^4"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
 def readme_block(language: str, containing: str) -> str:
     blocks = (ROOT / "README.md").read_text().split("```")[1::2]
     found = [b for b in blocks if b.startswith(language) and containing in b]

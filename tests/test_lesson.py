@@ -21,6 +21,8 @@ from printed import assert_same_output
 ROOT = Path(__file__).parent.parent
 LESSON = ROOT / "docs" / "lesson"
 ORB_SLAM = LESSON / "03_orb_slam.md"
+PLACES = LESSON / "03b_bag_of_words.md"
+LOOPS = LESSON / "03c_closing_loops.md"
 BACK_END = LESSON / "05_loop_closure_and_optimisation.md"
 PAGES = sorted(LESSON.glob("*.md"))
 CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
@@ -58,6 +60,8 @@ def test_there_are_chapters():
         "01_what_is_slam.md",
         "02_visual_odometry.md",
         "03_orb_slam.md",
+        "03b_bag_of_words.md",
+        "03c_closing_loops.md",
         "05_loop_closure_and_optimisation.md",
     ]
 
@@ -125,7 +129,7 @@ def ran(name: str) -> tuple[Any, str]:
     return results, printed.getvalue()
 
 
-SHOWN = shown_outputs(BACK_END) | shown_outputs(ORB_SLAM)
+SHOWN = {name: lines for page in CHAPTERS[2:] for name, lines in shown_outputs(page).items()}
 
 
 @pytest.mark.parametrize("name", SHOWN)
@@ -134,7 +138,13 @@ def test_an_example_prints_what_is_shown(name):
 
 
 @pytest.mark.parametrize(
-    ("page", "numbers"), [(BACK_END, range(12, 18)), (ORB_SLAM, range(18, 24))]
+    ("page", "numbers"),
+    [
+        (BACK_END, range(12, 18)),
+        (ORB_SLAM, range(18, 24)),
+        (PLACES, range(24, 25)),
+        (LOOPS, range(25, 28)),
+    ],
 )
 def test_all_examples_of_a_chapter_are_shown(page, numbers):
     files = {p.name for p in (ROOT / "examples").glob("[0-9]*.py") if int(p.name[:2]) in numbers}
@@ -207,6 +217,34 @@ def test_what_hangs_from_keyframes_has_no_cracks():
     }
     assert jumps["hung from keyframes"] < 0.12  # a step is 0.1 m
     assert jumps["stored in the world"] > 0.3
+
+
+def test_more_words_recognise_more_places():
+    recalls = list(ran("24_train_a_vocabulary.py")[0].values())
+    assert recalls == sorted(recalls)
+    assert recalls[0] < 0.5 < 0.7 < recalls[-1]
+
+
+def test_a_loop_is_measured_and_makes_the_path_better():
+    results = ran("25_close_a_loop.py")[0]
+    assert results["loop"] < 0.7 * results["path"]
+    assert results["with"] < results["without"]
+
+
+def test_only_similarities_give_one_camera_its_unit_back():
+    results = ran("26_scale_drift.py")[0]
+    errors = {name: error for name, (error, _, _) in results.items()}
+    assert 10 * errors["Sim3"] < errors["SE3"] < errors["no loop"]
+    assert results["Sim3"][1] == pytest.approx(1.0, abs=0.02)
+    assert results["SE3"][1] < 0.75
+
+
+def test_a_loop_makes_surer_once():
+    results = ran("27_surer_after_a_loop.py")[0]
+    sigma, nees = zip(*results.values())
+    assert 20 * sigma[1] < sigma[0]
+    assert max(nees[:2]) < 1.3
+    assert nees[2] > 10.0
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
