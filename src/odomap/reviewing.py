@@ -9,7 +9,7 @@ Cost: O(map) once, then O(1) per look.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ __all__ = ["PastRun", "review"]
 
 Array = NDArray[np.float64]
 
-PATH_FILE, MAP_FILE = "trajectory.tum", "map.odomap"
+PATH_FILE, LIVE_FILE, MAP_FILE = "trajectory.tum", "trajectory_live.tum", "map.odomap"
 LANDMARKS = 100_000
 """At most so many are shown: nothing else needs the machine."""
 PAUSE = 5.0
@@ -46,6 +46,7 @@ class PastRun:
         name: for people.
         trajectory: T_world_body of its frames, or of the keyframes where there is no path.
         map: what is remembered; an empty one where there is no map.
+        told: (N, 3) the path as it was told frame by frame; none where nobody says.
         camera: the camera that was tracked, None where nobody says.
         T_body_camera: its mount.
     """
@@ -55,6 +56,7 @@ class PastRun:
     map: Map
     camera: Camera | None
     T_body_camera: SE3
+    told: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def read(cls, path: str | Path) -> "PastRun":
@@ -76,7 +78,11 @@ class PastRun:
         trajectory = read_tum(path_file) if has_path else _keyframes(found)
         if not len(trajectory):
             raise InputError(f"{place}: there is no pose in it")
-        return cls(place.name or str(place), trajectory, found, camera, T_body_camera)
+        live = place / LIVE_FILE
+        told = read_tum(live) if has_path and live.is_file() else trajectory.rows([])
+        Ts = told.Ts_world_body @ T_body_camera.matrix
+        name = place.name or str(place)
+        return cls(name, trajectory, found, camera, T_body_camera, Ts[:, :3, 3])
 
 
 def review(path: str | Path, host: str = HOST, port: int = PORT) -> None:
@@ -112,8 +118,8 @@ class Review:
         self._Ts = past.trajectory.Ts_world_body @ past.T_body_camera.matrix
         sample = LandmarkSample(LANDMARKS)
         sample.add(past.map.landmark_ids)
-        seen = sketch(past.map, sample)
-        self._counts = (
+        seen = sketch(past.map, sample, past.T_body_camera.t)
+        self._counts: tuple[tuple[str, str], ...] = (
             ("keyframes", str(len(seen.Ts_world_body))),
             ("landmarks", str(seen.num_landmarks)),
         )
@@ -121,6 +127,10 @@ class Review:
         nowhere = np.zeros(len(seen.points), np.bool_)
         scene.show_map(seen.points, nowhere, seen.Ts_world_body @ past.T_body_camera.matrix)
         scene.show_path(self._Ts[:, :3, 3], pauses(past.trajectory.stamps_ns))
+        told = past.told if len(seen.loops) else past.told[:0]
+        scene.show_loops(seen.loops, seen.gaps, told)
+        if len(seen.loops):
+            self._counts += (("loops", str(len(seen.loops))),)
 
     def go_on(self) -> None:
         """Look where the slider is, and draw the camera there."""

@@ -40,7 +40,7 @@ from odomap.views.liveserver import HOST, PORT, check_viewer, close_server, open
 
 if TYPE_CHECKING:
     from odomap.system.config import Config
-    from odomap.system.stages import MapState
+    from odomap.system.stages import Loop, MapState
     from odomap.system.worker import Worker
 
 __all__ = ["View", "check_view", "serve", "tracked_camera", "watching"]
@@ -55,6 +55,8 @@ MESSAGES = 1024
 """Estimates that may wait to be drawn."""
 RECENT = 4
 """Frames kept until their estimate comes."""
+NEWS_FOR_S = 20.0
+"""What has just happened is said for so long."""
 PATIENCE_S = 5.0
 """How long drawing may take when it is no longer wanted."""
 ENOUGH = 20
@@ -104,14 +106,15 @@ class View:
             config: its configuration, which says the cameras that it tracks.
         """
         self._stop()
-        self._drawing = _Drawing(
-            self._server, system.map, *tracked_camera(rig, config.tracking.sensors)
-        )
+        sensors = config.tracking.sensors
+        unit = "units" if sensors == "mono" else "m"
+        self._drawing = _Drawing(self._server, system.map, *tracked_camera(rig, sensors), unit)
         self._frames: tuple[Frame, ...] = ()
         worker = system.worker
         worker.on_estimate.append(self._on_estimate)
         worker.on_keyframe.append(self._on_keyframe)
         worker.on_map.append(self._on_map)
+        worker.on_loop.append(self._on_loop)
         self._over = threading.Event()
         # A daemon: a program that ends without closing its view ends all the same.
         self._thread = threading.Thread(target=self._draw_on, name="odomap view", daemon=True)
@@ -151,6 +154,10 @@ class View:
     def _on_map(self, state: "MapState") -> None:
         self._drawing.is_stale = True
 
+    def _on_loop(self, loop: "Loop") -> None:
+        if loop.is_accepted:
+            self._drawing.closed.append(loop)
+
     # ---- in the thread of the view ----
 
     def _draw_on(self) -> None:
@@ -172,9 +179,17 @@ class _Drawing:
     """What is known of a run, and drawn from."""
 
     def __init__(
-        self, server: Any, map: Map, index: int, mount: CameraMount, T_body_camera: SE3
+        self,
+        server: Any,
+        map: Map,
+        index: int,
+        mount: CameraMount,
+        T_body_camera: SE3,
+        unit: str = "m",
     ) -> None:
         self.is_stale = True
+        self.closed: list[Loop] = []
+        self._unit, self._news_s, self._num_told = unit, -np.inf, 0
         self._map, self._index, self._T_body_camera = map, index, T_body_camera
         self._mailbox: Mailbox[Estimate] = Mailbox(MESSAGES)
         self._scene = LiveScene(server, mount.camera)
@@ -188,7 +203,7 @@ class _Drawing:
         self._is_facing = False
         self._tail: list[Array] = []
         self._laps: deque[float] = deque(maxlen=30)
-        self._num_landmarks = self._num_keyframes = 0
+        self._num_landmarks = self._num_keyframes = self._num_loops = 0
 
     def tell(self, estimate: Estimate, frame: Frame | None) -> None:
         """Take note of an estimate; from the tracker's thread."""
@@ -204,7 +219,7 @@ class _Drawing:
         if self.is_stale and now_s - self._read_s >= MAP_EVERY_S:
             self.is_stale, self._read_s = False, now_s
             self._show_map()
-        self._show_frame()
+        self._show_frame(now_s)
         self._scene.obey()
 
     def _take_in(self, estimate: Estimate) -> None:
@@ -219,7 +234,7 @@ class _Drawing:
         self._tail = self._tail[-MESSAGES:]
 
     def _show_map(self) -> None:
-        seen = sketch(self._map, self._sample)
+        seen = sketch(self._map, self._sample, self._T_body_camera.t)
         self._num_landmarks, self._num_keyframes = seen.num_landmarks, len(seen.Ts_world_body)
         if not self._is_facing and self._first is not None:
             reach = distance_seen(seen, self._T_body_camera)
@@ -230,9 +245,12 @@ class _Drawing:
         self._scene.show_map(seen.points, seen.is_seen, Ts_world_camera)
         positions, is_lost = self._path.positions(self._map)
         self._scene.show_path(positions, is_lost)
+        told = self._path.told if self.closed else positions[:0]
+        self._scene.show_loops(seen.loops, seen.gaps, told)
+        self._num_loops = len(seen.loops)
         self._tail = list(positions[-1:])
 
-    def _show_frame(self) -> None:
+    def _show_frame(self, now_s: float) -> None:
         if self._latest is None:
             return
         estimate, frame = self._latest
@@ -248,17 +266,32 @@ class _Drawing:
             )
             if len(self._tail) > 1:
                 self._scene.show_tail(np.array(self._tail))
-            self._scene.say(self._panel(estimate))
+            self._scene.say(self._panel(estimate, now_s))
         self._scene.follow(T_world_camera.matrix)
 
-    def _panel(self, estimate: Estimate) -> Panel:
+    def _panel(self, estimate: Estimate, now_s: float) -> Panel:
         rows = [("frame", str(estimate.frame_id))]
         if self._laps:
             rows.append(("ms per frame", f"{np.median(self._laps):.1f}"))
         rows.append(("inliers", str(estimate.num_inliers)))
         rows.append(("keyframes", str(self._num_keyframes)))
         rows.append(("landmarks", str(self._num_landmarks)))
-        return Panel(estimate.status.value, estimate.reason, tuple(rows))
+        if self._num_loops:
+            rows.append(("loops", str(self._num_loops)))
+        return Panel(estimate.status.value, estimate.reason, tuple(rows), self._news(now_s))
+
+    def _news(self, now_s: float) -> str:
+        """Say what the last loop did, for some seconds."""
+        if len(self.closed) > self._num_told:
+            self._num_told, self._news_s = len(self.closed), now_s
+        if now_s - self._news_s > NEWS_FOR_S:
+            return ""
+        loop = self.closed[-1]
+        what = "two pieces of the map are one" if loop.merges else "loop"
+        return (
+            f"{what}: keyframe {loop.keyframe_id} is back at {loop.matched_id}, path moved by "
+            f"{loop.moved:.2g} {self._unit}"
+        )
 
 
 def tracked_camera(rig: Rig, sensors: str) -> tuple[int, CameraMount, SE3]:

@@ -153,3 +153,38 @@ def test_frames_before_the_first_keyframe_have_no_place():
     path.add(estimate(0, -1, np.eye(4), Status.INITIALIZING))
     positions, is_lost = path.positions(Map())
     assert len(path) == len(positions) == len(is_lost) == 0
+
+
+def test_a_path_is_kept_as_it_was_told():
+    map, lever = make_map(), np.array([0.1, -0.2, 0.3])
+    path = LivePath(lever)
+    told = [pose(20), pose(21)]
+    for n, T in enumerate(told):
+        path.add(estimate(n, n, T))
+    snapshot = map.snapshot([0, 1, 2], landmarks=False)
+    map.apply(snapshot.solved(np.array([pose(30), pose(31), pose(32)]), np.zeros((0, 3))))
+    np.testing.assert_allclose(path.told, [T[:3, :3] @ lever + T[:3, 3] for T in told], atol=1e-12)
+    assert np.abs(path.positions(map)[0] - path.told).max() > 0.1
+
+
+def test_loops_are_where_the_camera_was_also_at_culled_keyframes():
+    map, lever = make_map(4), np.array([0.1, -0.2, 0.3])
+    map.add_edge(0, 3, pose(7), np.eye(6), "loop")
+    map.add_edge(1, 2, pose(8), np.eye(6), "odometry")
+    before = sketch(map, LandmarkSample(), lever)
+    expected = [pose(k)[:3, :3] @ lever + pose(k)[:3, 3] for k in (0, 3)]
+    np.testing.assert_allclose(before.loops, [expected], atol=1e-12)
+    assert before.gaps.shape == (0, 2, 3)
+    map.cull_keyframes([0])
+    np.testing.assert_allclose(sketch(map, LandmarkSample(), lever).loops, [expected], atol=1e-9)
+
+
+def test_a_gap_is_there_until_a_loop_has_closed_it():
+    map = make_map(2)
+    begun = map.new_keyframe_id()
+    map.add_keyframe(Keyframe(begun, 500), pose(5))
+    map.begin_piece(begun)
+    (gap,) = sketch(map, LandmarkSample()).gaps
+    np.testing.assert_allclose(gap, [pose(1)[:3, 3], pose(5)[:3, 3]], atol=1e-12)
+    map.add_edge(0, begun, pose(7), np.eye(6), "loop")
+    assert len(sketch(map, LandmarkSample()).gaps) == 0

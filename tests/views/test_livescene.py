@@ -134,3 +134,29 @@ def test_the_panel_escapes_what_is_not_ours():
     assert "<script>" not in text
     assert "&lt;script&gt;1&lt;/script&gt; &amp; gone" in text
     assert "a&lt;b" in text
+
+
+def test_the_panel_says_what_has_just_happened():
+    text = panel_html(Panel("tracking", "", (), "loop: keyframe 120 is <back>"))
+    assert "loop: keyframe 120 is &lt;back&gt;" in text
+    assert "color:#ff69d2" in text
+
+
+def test_loops_gaps_and_the_path_before_them_can_be_hidden(scene):
+    loops, gaps = np.arange(12.0).reshape(2, 2, 3), np.array([[[0.0] * 3, [23.0, 0.0, 0.0]]])
+    scene.show_loops(loops, gaps, np.arange(9.0).reshape(3, 3))
+    assert np.array_equal(scene._loops.points, loops.astype(np.float32))
+    assert len(scene._loop_ends.points) == 4
+    assert len(scene._told.points) == 2
+    dashed = scene._gaps.points
+    assert dashed[0, 0, 0] == 0.0
+    assert dashed[-1, 1, 0] == 23.0
+    np.testing.assert_allclose(dashed[:, 1, 0] - dashed[:, 0, 0], 1.0, rtol=1e-5)
+    scene.obey()
+    assert scene._loops.visible
+    assert scene._told.visible
+    scene._shows_loops.value = scene._shows_told.value = False
+    scene.obey()
+    assert not any(n.visible for n in (scene._loops, scene._gaps, scene._told))
+    scene.show_loops(loops[:0], gaps[:0], np.zeros((0, 3)))
+    assert all(len(n.points) == 0 for n in (scene._loops, scene._gaps, scene._told))

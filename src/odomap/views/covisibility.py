@@ -17,9 +17,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.maps.edges import GAP, LOOP
 from odomap.maps.map import Map
-from odomap.views.loopview import edges_of
+from odomap.views.loopview import gap_ends, loop_ends
 
 __all__ = ["MapView"]
 
@@ -79,8 +78,8 @@ class MapView:
             kept[:, 2],
             len(table),
             least,
-            scale * edges_of(map, LOOP),
-            scale * edges_of(map, GAP),
+            scale * loop_ends(map),
+            scale * gap_ends(map),
         )
 
 

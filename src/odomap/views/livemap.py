@@ -4,7 +4,8 @@ A picture needs neither every landmark nor all of them at one instant. So a samp
 divisible by a power of two that grows with the map: a landmark that is shown stays shown. Its ids
 come from the newest keyframes, its places are asked for by the thousand, each time with the lock
 held for a fraction of a millisecond, whatever the size of the map. The path is kept as it hangs
-from keyframes, p_world = S_keyframe p_keyframe, so that it moves with them when a loop closes.
+from keyframes, p_world = S_keyframe p_keyframe, so that it moves with them when a loop closes, and
+as it was told frame by frame, which shows from where it moved.
 
 Reading O(sample + keyframes + frames), lock O(CHUNK).
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from odomap.maps.columns import distinct, grown
 from odomap.maps.estimate import Estimate, Status
 from odomap.maps.map import Map
+from odomap.views.loopview import gap_ends, loop_ends
 
 __all__ = ["LandmarkSample", "LivePath", "Sketch", "sketch"]
 
@@ -43,12 +45,16 @@ class Sketch:
         is_seen: (M,) whether the newest keyframe sees them.
         Ts_world_body: (K, 4, 4) of the living keyframes.
         num_landmarks: how many there are, shown or not.
+        loops: (L, 2, 3) ends of loops that were closed.
+        gaps: (G, 2, 3) keyframes between which nothing was measured.
     """
 
     points: Array
     is_seen: NDArray[np.bool_]
     Ts_world_body: Array
     num_landmarks: int
+    loops: Array
+    gaps: Array
 
 
 class LandmarkSample:
@@ -101,6 +107,7 @@ class LivePath:
         self._rows = 0
         self._keyframe = np.zeros(0, np.int64)
         self._place = np.zeros((0, 3))
+        self._told = np.zeros((0, 3))
         self._is_lost = np.zeros(0, np.bool_)
 
     def __len__(self) -> int:
@@ -114,11 +121,19 @@ class LivePath:
         self._rows += 1
         self._keyframe = grown(self._keyframe, self._rows)
         self._place = grown(self._place, self._rows)
+        self._told = grown(self._told, self._rows)
         self._is_lost = grown(self._is_lost, self._rows)
         T = estimate.T_keyframe_body.matrix
         self._keyframe[k] = estimate.keyframe_id
         self._place[k] = T[:3, :3] @ self._t + T[:3, 3]
         self._is_lost[k] = estimate.status == Status.LOST
+        T = estimate.T_world_body.matrix
+        self._told[k] = T[:3, :3] @ self._t + T[:3, 3]
+
+    @property
+    def told(self) -> Array:
+        """(N, 3) the places in the world as they were told when the frames came."""
+        return self._told[: self._rows]
 
     def positions(self, map: Map) -> tuple[Array, NDArray[np.bool_]]:
         """Return the (N, 3) places in the world as known now, and (N,) which frames were lost."""
@@ -132,12 +147,13 @@ class LivePath:
         return Ts[:, :3, 3] + scales[:, None] * turned, is_lost
 
 
-def sketch(map: Map, sample: LandmarkSample) -> Sketch:
+def sketch(map: Map, sample: LandmarkSample, t_body_camera: Array | None = None) -> Sketch:
     """Read what is drawn of a map, a little at a time.
 
     Args:
         map: may change meanwhile; then a part is of before, another of after.
         sample: the landmarks wanted; those that the newest keyframes see join it.
+        t_body_camera: (3,) the point on the body that loops are drawn at; default its origin.
     """
     keyframes = map.keyframe_ids
     seen = np.zeros(0, np.int64)
@@ -147,7 +163,14 @@ def sketch(map: Map, sample: LandmarkSample) -> Sketch:
     points = sample.places(map)
     is_seen = np.isin(sample.ids, seen)
     Ts = [map.Ts_world_body(chunk) for chunk in _chunks(keyframes)]
-    return Sketch(points, is_seen, np.concatenate([np.zeros((0, 4, 4)), *Ts]), map.num_landmarks)
+    return Sketch(
+        points,
+        is_seen,
+        np.concatenate([np.zeros((0, 4, 4)), *Ts]),
+        map.num_landmarks,
+        loop_ends(map, t_body_camera),
+        gap_ends(map, t_body_camera),
+    )
 
 
 def _chunks(ids: Ids) -> list[Ids]:

@@ -31,6 +31,9 @@ KEYFRAME: Colour = (230, 159, 0)
 CAMERA: Colour = (53, 224, 161)
 LANDMARK: Colour = (150, 160, 176)
 SEEN: Colour = (240, 228, 66)
+LOOP: Colour = (255, 105, 210)
+TOLD: Colour = (84, 104, 130)
+GAP: Colour = (110, 118, 132)
 STATUS_COLOURS = {"tracking": CAMERA, "recovered": SEEN, "initializing": PATH, "lost": LOST}
 
 PATH_POINTS = 5000
@@ -39,6 +42,9 @@ KEYFRAMES = 2000
 FRUSTUM_IMAGE_PX = 320
 WIDEST_VIEW = 1.2
 """Frusta are at most so wide at distance 1, also those of a fisheye."""
+
+DASHES = 12
+"""Of a gap."""
 
 KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.07, 0.003
 """Sizes as shares of the distance to what the camera sees."""
@@ -52,11 +58,13 @@ class Panel:
         status: of the last frame.
         reason: what is wrong; empty when nothing is.
         rows: further lines, name and value.
+        news: what has just happened; empty when nothing has.
     """
 
     status: str
     reason: str
     rows: tuple[tuple[str, str], ...]
+    news: str = ""
 
 
 class LiveScene:
@@ -89,6 +97,8 @@ class LiveScene:
             self._slider = gui.add_slider("frame", 0, max(frames - 1, 1), 1, frames - 1)
         self._follow = gui.add_checkbox("follow camera", True)
         self._shows_keyframes = gui.add_checkbox("keyframes", True)
+        self._shows_loops = gui.add_checkbox("loops", True)
+        self._shows_told = gui.add_checkbox("path before loops", True)
         self._point_size = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         self._picture: Any = None
 
@@ -110,16 +120,24 @@ class LiveScene:
             for lost, name, colour in ((False, "known", PATH), (True, "lost", LOST))
         }
         self._tail = lines("/run/path/newest", PATH, 3.0)
+        self._told = lines("/run/path/told", TOLD, 2.0)
+        self._loops = lines("/run/loops/lines", LOOP, 4.0)
+        self._gaps = lines("/run/loops/gaps", GAP, 1.5)
         self._keyframes = lines("/run/keyframes", KEYFRAME, 1.5)
-        self._points = {
-            seen: scene.add_point_cloud(
-                f"/run/landmarks/{name}",
+
+        def dots(name: str, colour: Colour) -> Any:
+            return scene.add_point_cloud(
+                name,
                 np.zeros((0, 3), np.float32),
                 colour,
                 point_shape="circle",
                 point_shading="flat",
                 precision="float32",
             )
+
+        self._loop_ends = dots("/run/loops/ends", LOOP)
+        self._points = {
+            seen: dots(f"/run/landmarks/{name}", colour)
             for seen, name, colour in ((False, "known", LANDMARK), (True, "in sight", SEEN))
         }
         self._camera = scene.add_camera_frustum(
@@ -188,6 +206,22 @@ class LiveScene:
                 Ts_world_camera[keep], self._opening, KEYFRAME_SIZE * self.reach
             )
 
+    def show_loops(self, loops: Array, gaps: Array, told: Array) -> None:
+        """Draw places that were seen before, and the path as it was until that was known.
+
+        Args:
+            loops: (L, 2, 3) ends of those that were closed.
+            gaps: (G, 2, 3) ends of what was never measured.
+            told: (N, 3) the path as it was told frame by frame; none draws none.
+        """
+        keep = thin(len(told), PATH_POINTS)
+        segments = np.stack([told[keep[:-1]], told[keep[1:]]], axis=1)
+        with self._server.atomic():
+            self._loops.points = loops.astype(np.float32)
+            self._loop_ends.points = loops.reshape(-1, 3).astype(np.float32)
+            self._gaps.points = dashes(gaps)
+            self._told.points = segments.astype(np.float32)
+
     def show_camera(
         self, T_world_camera: Array, wxyz: Array, image: NDArray[np.uint8] | None, is_lost: bool
     ) -> None:
@@ -233,6 +267,10 @@ class LiveScene:
     def obey(self) -> None:
         """Do what the controls say that needs nothing but the scene."""
         self._keyframes.visible = bool(self._shows_keyframes.value)
+        for node in (self._loops, self._loop_ends, self._gaps):
+            node.visible = bool(self._shows_loops.value)
+        self._told.visible = bool(self._shows_told.value)
+        self._loop_ends.point_size = 3.0 * POINT_SIZE * self.reach
         for seen, node in self._points.items():
             size = POINT_SIZE * self.reach * float(self._point_size.value)
             node.point_size = 1.5 * size if seen else size
@@ -264,12 +302,22 @@ def frusta(
     return np.asarray(world[:, edges].reshape(-1, 2, 3), np.float32)
 
 
+def dashes(ends: Array) -> NDArray[np.float32]:
+    """Return the (D G, 2, 3) dashes between the ends (G, 2, 3) of gaps."""
+    at = np.arange(2 * DASHES).reshape(DASHES, 2) / (2 * DASHES - 1)
+    start, step = ends[:, None, None, 0], (ends[:, 1] - ends[:, 0])[:, None, None]
+    return np.asarray((start + at[..., None] * step).reshape(-1, 2, 3), np.float32)
+
+
 def panel_html(panel: Panel) -> str:
     """Return the panel as a small table; what is not ours to know is escaped."""
     colour = "#{:02x}{:02x}{:02x}".format(*STATUS_COLOURS.get(panel.status, LANDMARK))
     head = f'<b style="color:{colour}">&#9679; {html.escape(panel.status)}</b>'
     if panel.reason:
         head += f'<div style="opacity:.8">{html.escape(panel.reason)}</div>'
+    if panel.news:
+        loop = "#{:02x}{:02x}{:02x}".format(*LOOP)
+        head += f'<div style="color:{loop}">{html.escape(panel.news)}</div>'
     lines = "".join(
         f'<tr><td style="opacity:.7;padding-right:1em">{html.escape(name)}</td>'
         f"<td>{html.escape(value)}</td></tr>"

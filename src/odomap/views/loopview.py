@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from odomap.files.loops import LoopLog, LoopRecord
 from odomap.geometry.pose import Sim3
 from odomap.geometry.trajectory import Trajectory
+from odomap.maps.atlas import Atlas
+from odomap.maps.edges import GAP, LOOP
 from odomap.maps.map import Map
 
-__all__ = ["LoopView", "edges_of"]
+__all__ = ["LoopView", "gap_ends", "loop_ends"]
 
 Array = NDArray[np.float64]
 
@@ -76,16 +78,32 @@ def _told(record: LoopRecord, live: Trajectory, now: Array) -> Array:
     return out
 
 
-def edges_of(map: Map, kind: str) -> Array:
-    """Return (E, 2, 3) where the ends of a map's edges of one kind are in the world.
+def loop_ends(map: Map, t_body: Array | None = None) -> Array:
+    """Return (L, 2, 3) where the ends of a map's loops are in the world.
 
     Args:
-        map: read under its lock; ends that were culled are where their stubs are.
-        kind: such as "loop".
+        map: may change meanwhile; ends that were culled are where their stubs are.
+        t_body: (3,) the point on the body that is wanted; default its origin.
     """
-    with map.lock:
-        edges = map.edges()
-        chosen = np.flatnonzero(np.array(edges.kind, str) == kind)
-        ends = np.stack([edges.i[chosen], edges.j[chosen]], axis=1)
-        places = map.Ts_world_body(ends.ravel())[:, :3, 3]
+    edges = map.edges()
+    chosen = np.flatnonzero(np.array(edges.kind, str) == LOOP)
+    return _places(map, np.stack([edges.i[chosen], edges.j[chosen]], axis=1), t_body)
+
+
+def gap_ends(map: Map, t_body: Array | None = None) -> Array:
+    """Return (G, 2, 3) where the ends of gaps are that no loop has closed yet.
+
+    Args:
+        map: may change meanwhile.
+        t_body: (3,) the point on the body that is wanted; default its origin.
+    """
+    pieces = Atlas(map).pieces if GAP in map.edges().kind else ()
+    ids = [(piece.after_id, piece.first_id) for piece in pieces if piece.after_id >= 0]
+    return _places(map, np.array(ids, np.int64).reshape(-1, 2), t_body)
+
+
+def _places(map: Map, ids: NDArray[np.int64], t_body: Array | None) -> Array:
+    """Return the places (n, 2, 3) of keyframes (n, 2)."""
+    Ts = map.Ts_world_body(ids.ravel())
+    places = Ts[:, :3, 3] if t_body is None else Ts[:, :3, :3] @ t_body + Ts[:, :3, 3]
     return np.asarray(places.reshape(-1, 2, 3))
