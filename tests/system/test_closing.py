@@ -9,6 +9,7 @@ from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.lie import se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.maps.states import stretched
 from odomap.system.closing import LoopCloser, SideVerifier
 from odomap.system.config import preset
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
@@ -135,16 +136,20 @@ def test_what_was_mapped_while_a_loop_was_solved_is_kept(vocabulary):
     assert circuit.errors()[-1] < 0.05
 
 
-def test_a_mapper_that_began_before_does_not_undo_what_a_loop_says_of_certainty(vocabulary):
-    circuit, told = Circuit(around(80), Walls.make(), seed=1), []
-    closer = closer_of(circuit, vocabulary, on_closed=lambda: told.append(circuit.count))
+@pytest.mark.parametrize("drift", [0.0, 0.03])
+def test_a_mapper_that_began_before_does_not_undo_what_a_loop_says_of_certainty(vocabulary, drift):
+    circuit, told = Circuit(around(80), Walls.make(), seed=1, scale=drift), []
+    how = {"with_scale": drift > 0.0, "on_closed": lambda: told.append(circuit.count)}
+    closer = closer_of(circuit, vocabulary, **how)
     change = go_until_closed(circuit, closer)
     keyframe = circuit.add()
     unaware = circuit.map.covariance(keyframe.id)
     change.write(circuit.map)
     assert told == [circuit.count]
     carried = circuit.map.covariance(keyframe.id)
-    circuit.map.set_covariance([keyframe.id], unaware)
+    scale = circuit.map.scale(keyframe.id)  # the mapper tells it in units of the world as it is now
+    assert (scale == 1.0) == (drift == 0.0)
+    circuit.map.set_covariance([keyframe.id], stretched(unaware, scale))
     closer.add(keyframe).solve().write(circuit.map)
     np.testing.assert_allclose(circuit.map.covariance(keyframe.id), carried, atol=1e-12)
     assert len(told) == 2

@@ -13,6 +13,8 @@ from odomap.maps.snapshot import Update
 from odomap.maps.states import compose, inverse, stretched
 from odomap.system.config import preset
 from odomap.system.slam import Slam
+from system.test_localmapping import as_map, mapper_of
+from windowworlds import world
 
 HALF = 24
 
@@ -113,3 +115,38 @@ def test_what_comes_is_the_same_in_whatever_units(room, association, change, pla
     places, others = result.map.points_world(ids), reference.map.points_world(ids)
     away = np.linalg.norm(others, axis=1, keepdims=True)
     assert np.quantile(np.abs(places - others) / away, 0.99) < 1e-4
+
+
+def stretch_all(m, by=1.3):
+    """Have the whole world be larger, as a loop to another piece of the map may have it."""
+    with m.lock:
+        ids = m.keyframe_ids
+        everything = np.diag([1.0, 1.0, 1.0, 1.0]), np.asarray(by)
+        m.states.move(ids, compose(everything, m.states.placements(ids)))
+
+
+def mapped(order):
+    """Work on a window, write it, and stretch the world, in some order; return the map."""
+    m, change = as_map(world(known=0.4).window, off=0.01)[0], None
+    m.set_covariance(m.keyframe_ids, np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6]))
+    for step in order:
+        if step == "stretch":
+            stretch_all(m)
+        elif step == "work":
+            change = mapper_of(m).add(m.keyframe(int(m.keyframe_ids[-1]))).solve()
+        else:
+            change.write(m)
+    return m
+
+
+@pytest.mark.parametrize("order", [("work", "stretch", "write"), ("stretch", "work", "write")])
+def test_a_window_is_written_in_the_units_of_then(order):
+    expected, found = mapped(("work", "write", "stretch")), mapped(order)
+    ids, landmarks, newest = found.keyframe_ids, found.landmark_ids, int(found.keyframe_ids[-1])
+    assert found.scale(newest) == pytest.approx(1.3)
+    np.testing.assert_array_equal(landmarks, expected.landmark_ids)
+    np.testing.assert_allclose(found.Ts_world_body(ids), expected.Ts_world_body(ids), atol=1e-6)
+    places = expected.points_world(landmarks)
+    np.testing.assert_allclose(found.points_world(landmarks), places, rtol=1e-6, atol=1e-6)
+    sure = expected.covariance(newest)
+    np.testing.assert_allclose(found.covariance(newest), sure, rtol=1e-4, atol=1e-10)
