@@ -173,6 +173,10 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
     theirs, ours = _used(there, sensors), _used(here, sensors)
     if len(theirs) != len(ours):
         yield f"{len(theirs)} cameras there, {len(ours)} here"
+    if sensors == "stereo" and len(theirs) == len(ours) == 2:
+        apart = [_distance(*pair) for pair in (theirs, ours)]
+        if not np.isclose(*apart, rtol=1e-6, atol=1e-9):
+            yield f"the baseline is {apart[0]:.6g} m there, {apart[1]:.6g} m here"
     for a, b in zip(theirs, ours):
         for name, x, y in _numbers(a, b, sensors):
             same = np.shape(x) == np.shape(y) and (
@@ -187,6 +191,10 @@ def _used(rig: Rig, sensors: str) -> tuple[CameraMount, ...]:
     if sensors == "rgbd" and rig.depth is not None:
         return (rig.camera(rig.depth.camera),)
     return rig.cameras[: 2 if sensors == "stereo" else 1]
+
+
+def _distance(a: CameraMount, b: CameraMount) -> float:
+    return float(np.linalg.norm(a.T_body_camera.t - b.T_body_camera.t))
 
 
 def _numbers(a: CameraMount, b: CameraMount, sensors: str) -> Iterator[tuple[str, Any, Any]]:
