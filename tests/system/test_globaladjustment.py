@@ -1,6 +1,7 @@
 """The whole map adjusted: nearer to the truth, whole after each part, given up where told."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ from mapworlds import same_map
 from odomap.backend.bundle import BundleConfig
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.maps.keyframes import Keyframe
+from odomap.simulation.world import World
 from odomap.system.adjusting import AdjustingConfig
+from odomap.system.config import preset
 from odomap.system.depthbias import DepthBias
 from odomap.system.globaladjustment import GlobalAdjuster
+from odomap.system.slam import Slam
 
 
 def adjuster_of(w, bias=0.0, **how):
@@ -171,3 +175,17 @@ def test_a_map_without_anything_seen_twice_is_left_alone():
     w = adjust_world(keyframes=3, landmarks=300, spacing=40.0, seed=1)
     change = job_of(w).solve()
     assert change.parts() == ()
+
+
+@pytest.mark.parametrize(("closing", "adjusting"), [(True, True), (True, False), (False, True)])
+def test_slam_adjusts_where_it_closes_loops(closing, adjusting):
+    config = preset("stereo")
+    config = replace(
+        config,
+        closing=replace(config.closing, enabled=closing),
+        adjusting=replace(config.adjusting, enabled=adjusting),
+    )
+    rig = World.make(kind="room", frames=1, sensors=("stereo",)).rig
+    stages = Slam(rig, config).worker.stages
+    assert (stages.closer is not None) == closing
+    assert (stages.adjuster is not None) == (closing and adjusting)

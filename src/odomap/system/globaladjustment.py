@@ -71,9 +71,7 @@ class GlobalAdjuster:
         gate: residual beyond which an observation is dropped, standard deviations.
         bundle: how local mapping solves, for its loss.
         config: how much is done.
-
-    Attributes:
-        counts: adjustments written and observations dropped so far, by name.
+        counts: where is added up how many maps were adjusted and observations dropped, by name.
     """
 
     def __init__(
@@ -88,13 +86,14 @@ class GlobalAdjuster:
         gate: float,
         bundle: BundleConfig,
         config: AdjustingConfig | None = None,
+        counts: Counter[str] | None = None,
     ) -> None:
         self._map, self._T_camera_body = map, se3_inverse(T_body_camera)
         self._sigma, self.level_scale = sigma_px / camera.fx, level_scale
         self._depth_sigma, self._bias = sigma, bias
         self.gate, self.loss = gate, Loss("huber", bundle.huber_width)
         self.config = AdjustingConfig() if config is None else config
-        self.counts: Counter[str] = Counter()
+        self.counts = Counter[str]() if counts is None else counts
 
     def add(self, keyframe: Keyframe) -> "GlobalJob":
         """Begin to adjust the map as it will be when the job reads it."""
@@ -272,7 +271,7 @@ class _Keyframes:
         root = int(s.keyframe_ids[0])
         map.apply(correction(map, s.keyframe_ids, read, solved, root, s.version))
         wrong = len(self.solved.wrong)
-        self.adjuster.counts.update(adjustments=1, observations_dropped=wrong)
+        self.adjuster.counts.update(maps_adjusted=1, observations_dropped=wrong)
         logging.getLogger(__name__).info(
             "map adjusted: %d keyframes, %d landmarks, %d of %d observations were wrong",
             len(s.keyframe_ids),

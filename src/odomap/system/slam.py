@@ -153,6 +153,7 @@ class Slam(VisualSystem):
             sections.mapping.gate,
             sections.bundle,
             config.adjusting,
+            self._mapper.counts,
         )
 
     @property

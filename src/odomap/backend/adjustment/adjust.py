@@ -27,7 +27,7 @@ from odomap.backend.adjustment.covariance import ViewCovariance, view_covariance
 from odomap.backend.adjustment.descent import Criteria, Descent, checked_loss, chi2_of, state_of
 from odomap.backend.adjustment.gate import COARSE, LETS_GO, least_width, next_width
 from odomap.backend.adjustment.gauge import Gauge, bring_back, find_gauge
-from odomap.backend.adjustment.layout import Layout, lay_out
+from odomap.backend.adjustment.layout import Layout, count_free, lay_out
 from odomap.backend.adjustment.problem import Adjustment
 from odomap.backend.adjustment.reduced import METHODS, Method, reduced_solver
 from odomap.backend.descent import IterationRecord
@@ -329,7 +329,7 @@ def _variance_factor(problem: Adjustment, chi2: Array) -> float:
     seen = 2 * np.bincount(counted.point, minlength=counted.num_points)
     told = np.minimum(3, seen + np.bincount(deep, minlength=counted.num_points))
     unknown = int(told[~counted.is_fixed_point].sum())
-    unknown += int(np.count_nonzero(~lay_out(counted).blocks.is_held))
+    unknown += count_free(counted)
     surplus = 2 * counted.num_observations + len(deep) - unknown
     surplus += int(np.count_nonzero(find_gauge(counted).is_held))
     return float(chi2[~is_lost].sum() / surplus) if surplus > 0 else 1.0

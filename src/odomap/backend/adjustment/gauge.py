@@ -63,9 +63,11 @@ def find_gauge(problem: Adjustment) -> Gauge:
     """Return what holds the gauge of each connected part of a problem."""
     k, m = problem.num_views, problem.num_points
     label = connected_components(k + m, problem.view, k + problem.point)
-    touched = np.concatenate([problem.view, k + problem.point])
-    part = np.full(k + m, -1)
-    names, part[touched] = np.unique(label[touched], return_inverse=True)
+    touched, named = np.zeros((2, k + m), np.bool_)
+    touched[problem.view] = touched[k + problem.point] = True
+    named[label[touched]] = True
+    names = np.flatnonzero(named)
+    part = np.where(touched, np.cumsum(named)[label] - 1, -1)
     has_fixed_point = np.zeros(len(names), np.bool_)
     has_fixed_point[part[k:][problem.is_fixed_point & (part[k:] >= 0)]] = True
     has_depth = np.zeros(len(names), np.bool_)

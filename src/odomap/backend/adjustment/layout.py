@@ -23,7 +23,7 @@ from odomap.backend.adjustment.problem import Adjustment, num_parameters
 from odomap.backend.sparse.blocks import MAX_BLOCK
 from odomap.kernels import kernel
 
-__all__ = ["Blocks", "Incidences", "Layout", "Seen", "lay_out", "warm_up"]
+__all__ = ["Blocks", "Incidences", "Layout", "Seen", "count_free", "lay_out", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -127,6 +127,12 @@ def lay_out(problem: Adjustment, is_held_view: Mask | None = None) -> Layout:
     slabs = _starts(3 * blocks.size[touched])
     incidences = Incidences(first, touched, point, slabs, by_block, block_start)
     return Layout(order, point_order, seen, blocks, incidences, is_free_point, is_joined)
+
+
+def count_free(problem: Adjustment) -> int:
+    """Return how many scalars of views and lenses are free."""
+    blocks, _ = _blocks(problem, None)
+    return int(np.count_nonzero(~blocks.is_held))
 
 
 def _depths(problem: Adjustment, order: Index) -> tuple[Array, Array]:
