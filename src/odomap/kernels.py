@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast, overload
+from typing import Any, TypeVar, cast, overload
 
 __all__ = ["clear_cache", "kernel", "modules_with_kernels", "needed_modules", "warm_up"]
 
@@ -59,7 +59,9 @@ def kernel(function: F | None = None, *, reorder: bool = False) -> F | Callable[
         import numba
 
         fastmath = {"reassoc", "contract", "nsz", "arcp"} if reorder else False
-        compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=fastmath)
+        options: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
+        options["no_cfunc_wrapper"] = True  # nobody calls them from C
+        compiled = numba.njit(fastmath=fastmath, **options)
         return cast(F, compiled(inner))
 
     return compile_it if function is None else compile_it(function)

@@ -29,6 +29,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.backend.graphs.graphproblem import import_group
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import so3_log
 from odomap.maps.keyframes import Keyframe
@@ -141,6 +142,7 @@ class LoopCloser:
         self._with_scale, self._config, self._on_closed = with_scale, config, on_closed
         self._asked: list[Revisit] = []
         self._since_closed: int = config.rest
+        import_group("Sim3" if with_scale else "SE3")
         search.index(search.follow(map))
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":

@@ -102,12 +102,13 @@ def _harmonic_mean(A: Array, at: int, space: int) -> float:
 @kernel
 def _weights(information: Array, space: int, kappa: Array, tau: Array) -> None:
     """κ, τ as the docstring of the module has them."""
+    here = space - space  # a literal zero would compile `_harmonic_mean` once more
     for e in range(len(information)):
-        tau[e] = _harmonic_mean(information[e], 0, space)
+        tau[e] = _harmonic_mean(information[e], here, space)
         if space == 2:
             kappa[e] = max(information[e, 2, 2], 0.0)
         else:
-            kappa[e] = 0.5 * _harmonic_mean(information[e], 3, 3)
+            kappa[e] = 0.5 * _harmonic_mean(information[e], here + 3, space)
 
 
 @kernel

@@ -26,7 +26,14 @@ from odomap.geometry.lie_kernels import half_cot, se3_log_into, se3_right_jacobi
 from odomap.geometry.robust_kernels import loss_cost, loss_weight
 from odomap.kernels import kernel
 
-__all__ = ["TANGENT", "EdgeArrays", "TargetArrays", "cost_of_edges", "linearise_edges", "warm_up"]
+__all__ = [
+    "TANGENT",
+    "EdgeArrays",
+    "TargetArrays",
+    "compile_edges",
+    "cost_of_edges",
+    "linearise_edges",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -351,24 +358,14 @@ def cost_of_edges(
     return cost
 
 
-def warm_up() -> None:
-    """Compile the kernels of this module."""
-    first, second = np.array([0]), np.array([1])
-    for tangent in (TANGENT["SE2"], TANGENT["SE3"]):
-        k = len(tangent)
-        m = 3 if k == 3 else 4
-        Ts = np.tile(np.eye(m), (2, 1, 1))
-        for is_chordal in (False, True):
-            information = np.ones((1, 1, 2)) if is_chordal else np.eye(k)[None]
-            edges = EdgeArrays(
-                first, second, Ts[:1], information, np.ones(1), np.zeros(1, np.bool_)
-            )
-            into = TargetArrays(
-                np.array([-1]),
-                np.array([-1, 0]),
-                np.array([-1, 0]),
-                np.zeros(k * k),
-                np.zeros(k),
-            )
-            linearise_edges(tangent, Ts, edges, is_chordal, 0, 1.0, into, np.empty(1))
-            cost_of_edges(tangent, Ts, edges, is_chordal, 0, 1.0, np.empty(1))
+def compile_edges(group: str) -> None:
+    """Compile the kernels for motions of one group, of the plane (SE2) or of space (SE3)."""
+    tangent = TANGENT[group]
+    k = len(tangent)
+    Ts = np.tile(np.eye(3 if k == 3 else 4), (2, 1, 1))
+    first, second, one, no = np.array([0]), np.array([1]), np.ones(1), np.zeros(1, np.bool_)
+    edges = EdgeArrays(first, second, Ts[:1], np.eye(k)[None], one, no)
+    diagonal, row = np.array([-1, 0]), np.array([-1, 0])
+    into = TargetArrays(np.array([-1]), diagonal, row, np.zeros(k * k), np.zeros(k))
+    linearise_edges(tangent, Ts, edges, False, 0, 1.0, into, np.empty(1))
+    cost_of_edges(tangent, Ts, edges, False, 0, 1.0, np.empty(1))

@@ -3,13 +3,14 @@
 Unknown are the poses of all nodes that are not held, k numbers each, then the landmarks, d each.
 A prior is an edge from the world, a node that is held at the identity: nothing else treats it
 specially. Which edge adds to which block is looked up once, so that linearising walks through
-memory and never searches.
+memory and never searches. What only one group of poses needs is imported with the first problem of
+that group, or before (`import_group`): what is imported is compiled before a run begins.
 
 Reference: G. Grisetti, R. Kümmerle, C. Stachniss, W. Burgard, "A tutorial on graph-based SLAM",
 IEEE Intelligent Transportation Systems Magazine 2(4), 2010.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,7 @@ from odomap.backend.graphs.edges import (
     cost_of_edges,
     linearise_edges,
 )
-from odomap.backend.graphs.posegraph import PoseGraph
-from odomap.backend.graphs.sights import SightArrays, SightTargets, cost_of_sights, linearise_sights
-from odomap.backend.graphs.similarities import cost_of_similarities, linearise_similarities
+from odomap.backend.graphs.posegraph import Group, PoseGraph
 from odomap.backend.sparse.blockcholesky import BlockCholesky
 from odomap.backend.sparse.blocks import BlockPattern
 from odomap.geometry.lie import se2_inverse, se3_inverse, sim3_exp, sim3_inverse
@@ -34,7 +33,10 @@ from odomap.geometry.robust import Loss
 from odomap.geometry.robust_kernels import loss_code
 from odomap.kernels import kernel
 
-__all__ = ["GraphProblem", "GraphState", "warm_up"]
+if TYPE_CHECKING:
+    from odomap.backend.graphs.sights import SightArrays
+
+__all__ = ["GraphProblem", "GraphState", "import_group", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -46,6 +48,16 @@ class GraphState(NamedTuple):
 
     Ts: Array
     points: Array
+
+
+def import_group(group: Group) -> None:
+    """Import what is compiled for poses of one group alone."""
+    if group == "SE2":
+        import odomap.backend.graphs.planeedges
+    elif group == "SE3":
+        import odomap.backend.graphs.spaceedges
+    else:
+        import odomap.backend.graphs.similarities  # noqa: F401
 
 
 class GraphProblem:
@@ -69,11 +81,12 @@ class GraphProblem:
         is_robust: Bool,
         weights: Array,
     ) -> None:
+        import_group(graph.group)
         self.graph, self.is_chordal, self.loss = graph, is_chordal, loss_code(loss)
         self.tangent = TANGENT[graph.group]
         self.edges = _edge_arrays(graph, is_chordal, is_robust, weights)
         points = graph.points
-        self.sights = SightArrays(points.node, points.point, points.points_node, points.information)
+        self.sights = _sight_arrays(graph)
         n, m, k, d = graph.num_nodes, len(points.points_world), graph.dim, graph.space
         free = np.append(~is_held, False)
         self.column = np.where(free, np.cumsum(free) - 1, -1).astype(np.int64)
@@ -115,15 +128,19 @@ class GraphProblem:
         out.gradient[:] = 0.0
         into = TargetArrays(self._edge_pair, self._diagonal, self._row, out.values, out.gradient)
         if self.graph.group == "Sim3":
+            from odomap.backend.graphs.similarities import linearise_similarities
+
             out.cost = linearise_similarities(x.Ts, self.edges, *self.loss, into, self.chi2)
         else:
             out.cost = linearise_edges(
                 self.tangent, x.Ts, self.edges, self.is_chordal, *self.loss, into, self.chi2
             )
-        if len(self.sights.node):
-            out.cost += self._linearise_sights(x, out)
+        if self.sights is not None:
+            out.cost += self._linearise_sights(self.sights, x, out)
 
-    def _linearise_sights(self, x: GraphState, out: Linear) -> float:
+    def _linearise_sights(self, sights: "SightArrays", x: GraphState, out: Linear) -> float:
+        from odomap.backend.graphs.sights import SightTargets, linearise_sights
+
         first = self.num_free
         into = SightTargets(
             self._row,
@@ -136,12 +153,14 @@ class GraphProblem:
         )
         k = self.graph.dim
         return float(
-            linearise_sights(x.Ts, x.points, self.sights, k, *self.loss, into, self.chi2_of_sights)
+            linearise_sights(x.Ts, x.points, sights, k, *self.loss, into, self.chi2_of_sights)
         )
 
     def cost_of_edges(self, x: GraphState) -> float:
         """Return the cost of edges and priors at x; sights are left out."""
         if self.graph.group == "Sim3":
+            from odomap.backend.graphs.similarities import cost_of_similarities
+
             return cost_of_similarities(x.Ts, self.edges, *self.loss, self.chi2)
         return float(
             cost_of_edges(self.tangent, x.Ts, self.edges, self.is_chordal, *self.loss, self.chi2)
@@ -150,7 +169,9 @@ class GraphProblem:
     def cost(self, x: GraphState) -> float:
         """Return the cost of edges, priors and sights at x, and write χ² of each."""
         cost = self.cost_of_edges(x)
-        if len(self.sights.node):
+        if self.sights is not None:
+            from odomap.backend.graphs.sights import cost_of_sights
+
             cost += cost_of_sights(x.Ts, x.points, self.sights, *self.loss, self.chi2_of_sights)
         return cost
 
@@ -187,6 +208,16 @@ def _edge_arrays(graph: PoseGraph, is_chordal: bool, is_robust: Bool, weights: A
         np.concatenate([weights, np.ones(len(priors.node))]),
         np.concatenate([is_robust, np.zeros(len(priors.node), bool)]),
     )
+
+
+def _sight_arrays(graph: PoseGraph) -> "SightArrays | None":
+    """Return sights of landmarks; None where there are none, which need no kernels then."""
+    points = graph.points
+    if not len(points.node):
+        return None
+    from odomap.backend.graphs.sights import SightArrays
+
+    return SightArrays(points.node, points.point, points.points_node, points.information)
 
 
 def _places_of_pairs(pattern: BlockPattern, i: Index, j: Index) -> Index:

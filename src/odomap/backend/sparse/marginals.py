@@ -29,7 +29,14 @@ from odomap.backend.sparse.symbolic import Fronts
 from odomap.errors import InputError
 from odomap.kernels import kernel
 
-__all__ = ["Marginals", "joint_covariance", "marginal_blocks", "warm_up"]
+__all__ = [
+    "Marginals",
+    "fronts_of",
+    "joint_covariance",
+    "marginal_blocks",
+    "warm_up",
+    "ways_up",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -118,7 +125,7 @@ def marginal_blocks(factor: BlockCholesky, blocks: ArrayLike) -> Array:
     """
     factor.require_factor()
     chosen, size = _of_one_size(factor.pattern, blocks)
-    entries = _entries_up(factor.fronts)[_fronts_of(factor, chosen)]
+    entries = _entries_up(factor.fronts)[fronts_of(factor, chosen)]
     columns = -(-size // GROUP) * GROUP
     if 4.0 * columns * entries.sum() > 3.0 * factor.flops:
         return Marginals(factor).blocks(chosen)
@@ -150,7 +157,7 @@ def joint_covariance(factor: BlockCholesky, blocks: ArrayLike) -> Array:
     position = np.empty_like(fronts.rows)
     position[fronts.rows] = np.arange(len(position))
     at = position[wanted]
-    visited = _ways_up(fronts, np.unique(_fronts_of(factor, chosen)))
+    visited = ways_up(fronts, np.unique(fronts_of(factor, chosen)))
     local = np.empty(GROUP * int(fronts.width.max(initial=0)))
     joint = np.empty((len(at), len(at)))
     for c in range(0, len(at), GROUP):
@@ -182,7 +189,7 @@ def _of_one_size(pattern: BlockPattern, blocks: ArrayLike) -> tuple[Index, int]:
     return chosen, int(sizes[0]) if len(chosen) else 0
 
 
-def _fronts_of(factor: BlockCholesky, blocks: Index) -> Index:
+def fronts_of(factor: BlockCholesky, blocks: Index) -> Index:
     """Return the front in which each block is eliminated."""
     position = np.empty_like(factor.order)
     position[factor.order] = np.arange(len(position))
@@ -190,7 +197,7 @@ def _fronts_of(factor: BlockCholesky, blocks: Index) -> Index:
     return np.searchsorted(factor.fronts.pivot, row, side="right") - 1
 
 
-def _ways_up(fronts: Fronts, first: Index) -> Index:
+def ways_up(fronts: Fronts, first: Index) -> Index:
     """Return the given fronts and all above them, ascending."""
     is_above = np.zeros(len(fronts.parent), np.bool_)
     for s in first:
@@ -244,4 +251,5 @@ def warm_up() -> None:
     factor = BlockCholesky(BlockPattern.of([1, 1], [0], [1]))
     factor.factor(np.array([2.0, 2.0, 1.0]))
     Marginals(factor).blocks([0])
+    joint_covariance(factor, [0])
     _entries_up(factor.fronts)

@@ -1,0 +1,10 @@
+"""Edges between motions of space, compiled: imported where there are any (`graphproblem`)."""
+
+from odomap.backend.graphs.edges import compile_edges
+
+__all__ = ["warm_up"]
+
+
+def warm_up() -> None:
+    """Compile the kernels of `edges` for motions of space."""
+    compile_edges("SE3")
