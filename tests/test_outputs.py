@@ -39,7 +39,12 @@ def tracked():
 
 def numbers_of(result, book):
     metrics = book.numbers() | {"skipped": 0, "rhythm": "inline", "frames_dropped": 0}
-    metrics |= {"path_m": float(result.trajectory.path_length), "loops": 0, "compile_s": 0.0}
+    metrics |= {
+        "path_m": float(result.trajectory.path_length),
+        "loops_closed": None,
+        "loops_rejected": 0,
+        "compile_s": 0.0,
+    }
     return metrics | {"ate": None, "keyframes": 1, "landmarks": result.map.num_landmarks}
 
 

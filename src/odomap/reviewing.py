@@ -79,7 +79,7 @@ class PastRun:
         if not len(trajectory):
             raise InputError(f"{place}: there is no pose in it")
         live = place / LIVE_FILE
-        told = read_tum(live) if has_path and live.is_file() else trajectory.rows([])
+        told = read_tum(live) if has_path and live.is_file() else trajectory.rows(np.arange(0))
         Ts = told.Ts_world_body @ T_body_camera.matrix
         name = place.name or str(place)
         return cls(name, trajectory, found, camera, T_body_camera, Ts[:, :3, 3])

@@ -199,6 +199,7 @@ class _Drawing:
         self._latest: tuple[Estimate, Frame | None] | None = None
         self._first: SE3 | None = None
         self._drawn: Estimate | None = None
+        self._said: Panel | None = None
         self._read_s = -np.inf
         self._is_facing = False
         self._tail: list[Array] = []
@@ -266,7 +267,10 @@ class _Drawing:
             )
             if len(self._tail) > 1:
                 self._scene.show_tail(np.array(self._tail))
-            self._scene.say(self._panel(estimate, now_s))
+        panel = self._panel(estimate, now_s)
+        if panel != self._said:
+            self._said = panel
+            self._scene.say(panel)
         self._scene.follow(T_world_camera.matrix)
 
     def _panel(self, estimate: Estimate, now_s: float) -> Panel:

@@ -147,7 +147,7 @@ def make_report(n: int = 160, lost: range = range(0), **changes: object) -> Repo
         "metrics": {
             "frames": n, "tracked": n - len(lost), "lost": len(lost),
             "ms_per_frame": {"median": 9.31, "p95": 31.8}, "real_time_factor": 4.31,
-            "keyframes": 23, "landmarks": 3120, "loops": 0, "peak_memory_mb": 412.7,
+            "keyframes": 23, "landmarks": 3120, "loops_closed": 0, "peak_memory_mb": 412.7,
         },
         "samples": samples,
         "points": walls @ start[:3, :3].T + start[:3, 3],

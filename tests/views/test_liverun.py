@@ -12,12 +12,19 @@ import odomap.viewing
 from livepages import Chromium, browser, page, until
 from odomap.cli import main
 from odomap.errors import InputError, MissingExtra
-from odomap.reviewing import PastRun, pauses, review
+from odomap.files.mapfile import load_map, save_map
+from odomap.geometry.pose import SE3
+from odomap.maps.estimate import Estimate, Status
+from odomap.maps.keyframes import Keyframe
+from odomap.reviewing import PastRun, Review, pauses, review
 from odomap.run import run
 from odomap.sources.open import open as open_source
 from odomap.system.config import preset
 from odomap.system.odometry import make_odometry
+from odomap.system.stages import Loop
 from odomap.viewing import View
+from odomap.views.livescene import LiveScene
+from odomap.views.liveserver import close_server, open_server
 
 WORLD = "sim:room?seed=3&frames=12"
 FILES = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap", "config.yaml")
@@ -123,6 +130,34 @@ def test_whoever_comes_late_sees_the_whole_run(view, world):
         assert until(lambda: sum(again) > 10_000)
 
 
+def test_a_loop_is_said_for_some_seconds_and_drawn_with_the_path_before_it(view, monkeypatch):
+    """Without a run: a system whose tracker never tells anything again once the loop is closed."""
+    system = make_odometry(open_source(WORLD).rig, preset("stereo"))
+    view.watch(system, open_source(WORLD).rig, preset("stereo"))
+    m, T = system.map, np.eye(4)
+    for k in range(3):
+        m.add_keyframe(Keyframe(k, k), T)
+        T_now = SE3(T)
+        view._on_estimate(Estimate(k, k, Status.TRACKING, "", k, SE3.identity(), T_now, np.eye(6)))
+        T = T.copy()
+        T[0, 3] += 1.0
+    scene = drawing(view)._scene
+    with page(view.url):
+        assert until(lambda: len(scene._path[False].points) == 2)
+        assert len(scene._told.points) == 0
+        m.add_edge(0, 2, np.eye(4), np.eye(6), "loop")
+        view._on_loop(Loop(2, 1, np.eye(4), 3, False, "3 inliers of 30 needed"))
+        view._on_loop(Loop(2, 0, np.eye(4), 80, True, moved=0.83))
+        view._on_map(None)
+        news = "loop: keyframe 2 is back at 0, path moved by 0.83 m"
+        assert until(lambda: news in scene._words.content)
+        assert until(lambda: len(scene._loops.points) == 1)
+        assert len(scene._told.points) == 2
+        monkeypatch.setattr(odomap.viewing, "NEWS_FOR_S", 0.0)
+        assert until(lambda: news not in scene._words.content)
+        assert until(lambda: "loops" in scene._words.content)
+
+
 def test_a_view_can_watch_one_run_after_the_other(view, world):
     for _ in range(2):
         run(world, view=view, max_frames=4)
@@ -216,6 +251,28 @@ def test_a_past_run_is_what_the_run_left(plain, tmp_path):
     bare = PastRun.read(tmp_path)
     assert len(bare.trajectory) == len(plain.trajectory)
     assert bare.map.num_keyframes == 0
+
+
+def test_a_past_run_with_loops_has_the_path_before_them(plain, tmp_path, viser):
+    map = load_map(plain.out / "map.odomap")
+    first, last = map.keyframe_ids[[0, -1]].tolist()
+    map.add_edge(first, last, np.eye(4), np.eye(6), "loop")
+    for name in ("trajectory.tum", "trajectory_live.tum"):
+        (tmp_path / name).write_bytes((plain.out / name).read_bytes())
+    save_map(tmp_path / "map.odomap", map, open_source(WORLD).rig)
+    past = PastRun.read(tmp_path)
+    assert len(past.told) == len(plain.trajectory_live)
+    server, _ = open_server(port=8900)
+    try:
+        scene = LiveScene(server, past.camera, len(past.trajectory))
+        Review(past, scene).go_on()
+        assert len(scene._loops.points) == 1
+        assert len(scene._told.points) == len(past.told) - 1
+        assert "loops" in scene._words.content
+        Review(PastRun.read(plain.out), scene).go_on()
+        assert len(scene._told.points) == 0
+    finally:
+        close_server(server)
 
 
 def test_what_is_no_run_is_refused(tmp_path, capsys):

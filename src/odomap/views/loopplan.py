@@ -135,7 +135,7 @@ def _draw(ax: Axes, place: Scene, view: LoopView, panel: _Panel, is_after: bool)
     if is_after:
         keep = thin(len(place.positions), PATH_POINTS)
         now = panel.flat(place.positions[keep], place.stamps_ns[keep])
-        ax.plot(*was.T, color=PALETTE["band"], lw=2.2, label="path as it was before", zorder=3)
+        ax.plot(*was.T, color=PALETTE["before"], lw=2.2, label="path as it was before", zorder=3)
         ax.plot(*now.T, color=PALETTE["estimate"], lw=1.4, label="path", zorder=4)
     else:
         ax.plot(*was.T, color=PALETTE["estimate"], lw=1.4, label="path", zorder=4)
@@ -176,8 +176,7 @@ def _close(place: Scene, view: LoopView, axes: tuple[int, int], loop: int) -> tu
     ends = _moved(place, np.concatenate([view.before[loop], view.after[loop]]))[:, list(axes)]
     low, high = ends.min(axis=0), ends.max(axis=0)
     whole = float(np.ptp(place.positions, axis=0).max())
-    reach = max(float((high - low).max()), LEAST * whole)
-    return (low + high) / 2, np.full(2, MARGIN * reach)
+    return (low + high) / 2, MARGIN * np.maximum(high - low, LEAST * whole)
 
 
 def _show(ax: Axes, window: tuple[Array, Array]) -> None:

@@ -17,7 +17,7 @@ from odomap.views.scene import scene
 __all__ = ["loops_section"]
 
 FEW = 8
-"""Refused candidates that are shown at once."""
+"""Rejected candidates that are shown at once."""
 MOST = 500
 """Rows of a table at most."""
 WHAT = (
@@ -68,8 +68,8 @@ def _summary(view: LoopView, unit: str) -> str:
     """Say in a sentence what the loop that moved the path most did."""
     log, n = view.log, view.largest
     loop = log.closed[n]
-    count = "One loop was" if len(log.closed) == 1 else f"{len(log.closed)} loops were"
-    which = "" if len(log.closed) == 1 else f", most by loop {n + 1}"
+    head = f"{len(log.closed)} loops were closed. Loop {n + 1} moved the path most"
+    head = "One loop was closed" if len(log.closed) == 1 else head
     back = f"at {log.seconds(loop.stamp_ns):.1f} s the camera was back where it had been"
     when = (
         "in the map before"
@@ -77,7 +77,7 @@ def _summary(view: LoopView, unit: str) -> str:
         else f"at {log.seconds(loop.matched_stamp_ns):.1f} s"
     )
     by = _length(view.scale * loop.moved, unit)
-    return f"{count} closed{which}: {back} {when}; the path moved by {by} there."
+    return f"{head}: {back} {when}; the path moved by {by} there."
 
 
 def _length(metres: float, unit: str) -> str:
@@ -98,14 +98,14 @@ def _closed(log: LoopLog, scale: float, unit: str) -> str:
 
 
 def _rejected(log: LoopLog) -> str:
-    """Return the refused candidates: the nearest to it at once, the others folded."""
+    """Return the rejected candidates: the nearest to it at once, the others folded."""
     refused = log.rejected
     near = nearest(refused, FEW)
     note = (
         "Places that looked like one seen before, but did not agree in geometry, or not with the "
         "path. "
     )
-    title = f"<h3>Refused ({len(refused):,})</h3>"
+    title = f"<h3>Rejected ({len(refused):,})</h3>"
     if len(refused) <= FEW:
         return f'{title}<p class="note">{note}</p>{_reasons(log, refused)}'
     note += f"Those {FEW} with the most inliers:"
@@ -128,6 +128,10 @@ def _ends(log: LoopLog, loop: LoopRecord) -> list[str]:
     """Return when the camera came back, and when it had been there."""
     back = f"{log.seconds(loop.stamp_ns):.2f} s (frame {loop.frame})"
     if loop.matched_frame < 0:
-        return [text(back), text(f"keyframe {loop.matched_id} of the map before")]
+        return [_unbroken(back), text(f"keyframe {loop.matched_id} of the map before")]
     there = f"{log.seconds(loop.matched_stamp_ns):.2f} s (frame {loop.matched_frame})"
-    return [text(back), text(there)]
+    return [_unbroken(back), _unbroken(there)]
+
+
+def _unbroken(words: str) -> str:
+    return f'<span class="unbroken">{text(words)}</span>'

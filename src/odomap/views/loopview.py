@@ -79,7 +79,7 @@ def _told(record: LoopRecord, live: Trajectory, now: Array) -> Array:
 
 
 def loop_ends(map: Map, t_body: Array | None = None) -> Array:
-    """Return (L, 2, 3) where the ends of a map's loops are in the world.
+    """Return (L, 2, 3) where the ends of a map's loops are in the world, the newer one first.
 
     Args:
         map: may change meanwhile; ends that were culled are where their stubs are.
@@ -87,7 +87,7 @@ def loop_ends(map: Map, t_body: Array | None = None) -> Array:
     """
     edges = map.edges()
     chosen = np.flatnonzero(np.array(edges.kind, str) == LOOP)
-    return _places(map, np.stack([edges.i[chosen], edges.j[chosen]], axis=1), t_body)
+    return _places(map, np.stack([edges.j[chosen], edges.i[chosen]], axis=1), t_body)
 
 
 def gap_ends(map: Map, t_body: Array | None = None) -> Array:

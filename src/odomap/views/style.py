@@ -40,6 +40,7 @@ PALETTE = {
     "lost": "#d55e00",
     "good": "#009e73",
     "loop": "#b3268c",
+    "before": "#a9cfe6",
     "stage1": "#0173b3",
     "stage2": "#56b4e9",
     "stage3": "#019f74",

@@ -33,7 +33,7 @@ CARDS = {
     "real_time_factor": "times real time",
     "keyframes": "keyframes",
     "landmarks": "landmarks",
-    "loops": "loops closed",
+    "loops_closed": "loops closed",
     "peak_memory_mb": "peak memory",
 }
 
