@@ -256,6 +256,10 @@ class _Drawing:
             return
         estimate, frame = self._latest
         T_world_camera = estimate.T_world_body @ self._T_body_camera
+        panel = self._panel(estimate, now_s)
+        if panel != self._said:
+            self._said = panel
+            self._scene.say(panel)
         if estimate is not self._drawn:
             self._drawn = estimate
             images = () if frame is None else frame.images
@@ -267,10 +271,6 @@ class _Drawing:
             )
             if len(self._tail) > 1:
                 self._scene.show_tail(np.array(self._tail))
-        panel = self._panel(estimate, now_s)
-        if panel != self._said:
-            self._said = panel
-            self._scene.say(panel)
         self._scene.follow(T_world_camera.matrix)
 
     def _panel(self, estimate: Estimate, now_s: float) -> Panel:
