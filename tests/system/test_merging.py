@@ -5,15 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from odomap.evaluation.metrics import ate
 from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.maps.atlas import Atlas
+from odomap.maps.estimate import Status
 from odomap.maps.map import Map
+from odomap.simulation.world import World
 from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.config import preset
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.merging import MergeConfig, Merger
+from odomap.system.slam import Slam
 from odomap.vision.matching import MatchConfig
 from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
+
+from .conftest import Recording
 
 HALF = 50
 ENABLED = ClosingConfig(enabled=True)
@@ -184,3 +191,56 @@ def _leave(circuit, lost, unit):
     )
     m.states.covariances[lost] = np.diag([9.0, 9.0, 9.0, 4.0, 4.0, 4.0])
     m.begin_piece(lost)
+
+
+DARK = range(50, 100)
+"""Frames for which the lens is covered while the camera goes on."""
+ANEW = DARK[-1] + 12
+"""By this frame a new start is made, by a single camera, too."""
+
+
+@pytest.fixture(scope="module")
+def journey():
+    """Return a round through a room at ten frames a second, unseen for five seconds of it."""
+    world = World.make(
+        kind="room",
+        seed=2,
+        frames=188,
+        rate_hz=10.0,
+        resolution=(360, 225),
+        speed=1.0,
+        sensors=("stereo",),
+    )
+    frames = [None if n in DARK else world.frame(n) for n in range(len(world))]
+    for n in DARK:
+        black = tuple(np.zeros_like(image) for image in frames[0].images)
+        frames[n] = replace(frames[0], id=n, stamp_ns=int(world.truth.stamps_ns[n]), images=black)
+    return Recording(world.rig, world.truth, frames)
+
+
+@pytest.mark.parametrize("sensors", ["stereo", "mono"])
+def test_lost_for_long_a_new_piece_begins_and_is_merged_when_the_camera_is_back(
+    journey, vocabulary, sensors
+):
+    config = replace(preset(sensors), closing=ENABLED)
+    slam, loops = Slam(journey.rig, config, vocabulary=vocabulary), []
+    slam.worker.on_loop.append(loops.append)
+    reasons = []
+    for frame in journey:
+        estimate = slam.track(frame)
+        if frame.id in DARK or frame.id > ANEW:
+            assert (estimate.status is Status.LOST) == (frame.id in DARK)
+        reasons.append(estimate.reason)
+        if frame.id == ANEW:
+            assert len(Atlas(slam.map).pieces) == 2
+    assert any("started anew where it was last" in reason for reason in reasons[DARK[-1] :])
+    (merge,) = [loop for loop in loops if loop.merges]
+    assert merge.is_accepted
+    (piece,) = Atlas(slam.map).pieces
+    assert len(piece.merged) == 1
+    # From then on the keyframes of both pieces are where they were, in the units of the first.
+    result = slam.finish()
+    truth = result.truth(journey.truth)
+    path = np.linalg.norm(np.diff(truth.Ts_world_body[:, :3, 3], axis=0), axis=1).sum()
+    error = ate(result.trajectory, truth, align="sim3" if sensors == "mono" else "se3")
+    assert error.rmse < 0.004 * path
