@@ -245,7 +245,9 @@ def test_a_keyframe_of_the_map_before_has_no_frame(tmp_path, cli):
 
 
 def test_nothing_found_is_a_sentence(tmp_path, cli):
-    assert listed(tmp_path, cli) == ["street: no place looked like one seen before"]
+    assert listed(tmp_path, cli) == [
+        "street: no place looked like one seen before, but for those known at once"
+    ]
 
 
 def test_json_is_what_the_file_says(tmp_path, cli):

@@ -183,7 +183,7 @@ def test_nothing_appears_where_nobody_looked(report_of: Make) -> None:
 def test_nothing_found_is_a_sentence(report_of: Make) -> None:
     path, view = view_of()
     body = loops_section(report_of(4, trajectory=path, loops=view))
-    assert "No place looked like one seen before." in body
+    assert "No place looked like one seen before, but" in body
     assert "<svg" not in body
 
 
@@ -264,3 +264,23 @@ def test_a_map_s_view_has_its_loops_to_scale() -> None:
         m.add_keyframe(Keyframe(k, k), T)
     m.add_edge(0, 2, np.eye(4), np.eye(6), "loop")
     assert MapView.of(m, scale=2.0).loops[:, :, 0].tolist() == [[4.0, 0.0]]
+
+
+def test_the_path_of_a_run_shows_its_own_loops_not_those_of_a_map_before(report_of: Make) -> None:
+    path, view = view_of(closed())
+    none = np.zeros((0, 2), np.int64)
+    others = np.array([[[900.0, 0.0, 0.0], [901.0, 0.0, 0.0]]])
+    before = MapView(path.positions, np.zeros((0, 3)), none, none[:, 0], 0, loops=others)
+    made = [
+        render_report(
+            report_of(20, trajectory=path, truth=None, samples=(), map=before, loops=loops)
+        )
+        for loops in (None, view)
+    ]
+    legend = "loop: a place seen before"
+    assert [
+        legend in page.split("<h2>Loops</h2>")[0].split("<h2>Map</h2>")[0] for page in made
+    ] == [
+        False,
+        True,
+    ]

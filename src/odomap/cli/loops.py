@@ -81,7 +81,7 @@ def lines(loops: "LoopLog", is_all: bool = False) -> list[str]:
 
     head = f"{loops.name}: {loops_text(len(loops.closed), len(loops.rejected))}"
     if not loops.records:
-        return [f"{loops.name}: no place looked like one seen before"]
+        return [f"{loops.name}: no place looked like one seen before, but for those known at once"]
     chosen = loops.records if is_all else [*loops.closed, *nearest(loops.rejected, FEW)]
     rows = [["", "back at", "seen before at", "inliers", "path moved", ""]]
     rows += [_row(loops, record) for record in chosen]

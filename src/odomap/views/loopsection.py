@@ -24,6 +24,7 @@ WHAT = (
     "A loop is a place that the camera saw before. Until it comes back there, small errors add up "
     "unnoticed; there they show, and closing the loop moves the path so that both visits agree."
 )
+NONE = "No place looked like one seen before, but for those that tracking knew again by itself."
 INLIERS = "Points of both visits that agree with one position of the two cameras"
 
 
@@ -34,7 +35,7 @@ def loops_section(report: Report) -> str:
         return ""
     log = view.log
     if not log.records:
-        return f'<p>No place looked like one seen before.</p><p class="note">{WHAT}</p>'
+        return f'<p>{NONE}</p><p class="note">{WHAT}</p>'
     parts = [f'<p class="note">{WHAT}</p>', _plan(report, view)]
     if log.closed:
         parts.append(f"<h3>Closed</h3>{_closed(log, view.scale, report.unit)}")

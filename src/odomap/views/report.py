@@ -94,7 +94,7 @@ def _path(report: Report) -> str:
     if place is None:
         return '<p class="note">There is no path to show: no frame was tracked.</p>'
     keyframes = np.array([e.stamp_ns for e in report.estimates if e.is_keyframe], np.int64)
-    loops = None if report.map is None else report.map.loops
+    loops = None if report.loops is None else report.loops.after
     against = " against the true one" if place.truth is not None else ""
     label = f"The path{against}, from above and from the side"
     flat_view = figure_svg(
