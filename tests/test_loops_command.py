@@ -132,7 +132,8 @@ def test_where_nothing_was_a_candidate_the_list_is_empty(world, tmp_path):
 
 
 def test_where_nobody_looks_there_is_no_list_and_none_of_a_run_before(world, tmp_path, cli):
-    for how in ({}, {"odometry_only": True}):
+    closed = override(preset("stereo"), [("closing.enabled", "false")])
+    for how in ({"config": closed}, {"odometry_only": True}):
         (tmp_path / "loops.json").write_text("{}")
         found = run(world, tmp_path, max_frames=3, **how)
         assert not (tmp_path / "loops.json").exists()

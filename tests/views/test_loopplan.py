@@ -16,6 +16,7 @@ from odomap.views.covisibility import MapView
 from odomap.views.loopplan import loops_figure
 from odomap.views.loopsection import loops_section
 from odomap.views.loopview import LoopView
+from odomap.views.mapsection import map_section
 from odomap.views.plan import plan_axes, plan_figure
 from odomap.views.plots import path_figure
 from odomap.views.record import Report
@@ -284,3 +285,14 @@ def test_the_path_of_a_run_shows_its_own_loops_not_those_of_a_map_before(report_
         False,
         True,
     ]
+
+
+def test_a_map_says_what_loops_and_gaps_are(report_of: Make) -> None:
+    path, view = view_of(closed())
+    none = np.zeros((0, 2), np.int64)
+    plain = MapView(path.positions, np.zeros((0, 3)), none, none[:, 0], 0)
+    tied = replace(plain, loops=view.after, gaps=view.after)
+    words = "came back (dot)", "Dotted lines join pieces"
+    for shown, is_said in ((plain, False), (tied, True)):
+        body = map_section(report_of(4, trajectory=path, truth=None, map=shown))
+        assert all((word in body) is is_said for word in words)

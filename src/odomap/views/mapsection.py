@@ -35,7 +35,7 @@ def _plan(report: Report) -> str:
         plan_figure(place, view, report.unit),
         f"Landmarks, keyframes, the path{against}, from {where}",
     )
-    caption = f"Seen from {where}, along {along}{why}. {_joined(view)}"
+    caption = f"Seen from {where}, along {along}{why}. {_joined(view)}{_tied(view)}"
     return f"<figure>{svg}<figcaption>{text(caption)}</figcaption></figure>"
 
 
@@ -51,6 +51,16 @@ def _joined(view: "MapView") -> str:
         f"Green lines join keyframes that share {view.least} landmarks or more, the stronger the "
         f"more they share ({pairs}{drawn})."
     )
+
+
+def _tied(view: "MapView") -> str:
+    """Say what loops and gaps are, where there are any."""
+    words = ""
+    if len(view.loops):
+        words += " A loop leads from where the camera came back (dot) to where it had been (ring)."
+    if len(view.gaps):
+        words += " Dotted lines join pieces whose place to each other was never measured."
+    return words
 
 
 def _growth(report: Report) -> str:
