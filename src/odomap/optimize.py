@@ -107,6 +107,7 @@ def optimize(
     from odomap.backend.descent import SolverConfig
     from odomap.backend.graphs.certificate import certify as prove
     from odomap.backend.graphs.certificate import check_certifiable
+    from odomap.backend.graphs.graphproblem import import_group
     from odomap.backend.graphs.solve import solve
     from odomap.system.worker import deferred_interrupt
 
@@ -117,6 +118,7 @@ def optimize(
     check_out(graph, out, picture)
     if out is not None:
         check_graph_file(out, file.graph)
+    import_group(file.graph.group, len(file.graph.points.node) > 0)
     compile_imported(tell)
     with deferred_interrupt() as interrupt:
         try:

@@ -1,5 +1,7 @@
 """What edges, priors and sights add to the normal equations, against differences and NumPy."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -178,3 +180,23 @@ def test_half_a_turn_is_no_trouble(group):
     assert np.isfinite(out.cost)
     assert np.isfinite(out.gradient).all()
     assert np.isfinite(out.values).all()
+
+
+@pytest.mark.parametrize(
+    ("group", "with_sights", "names"),
+    [
+        ("SE2", False, {"planeedges"}),
+        ("SE3", True, {"spaceedges", "sights"}),
+        ("Sim3", False, {"similarities"}),
+    ],
+)
+def test_only_what_a_group_needs_is_there_to_be_compiled(group, with_sights, names):
+    code = (
+        "import sys; from odomap.backend.graphs.graphproblem import import_group; "
+        f"import_group({group!r}, {with_sights}); "
+        "from odomap.kernels import needed_modules; "
+        "print(*(name.rpartition('.')[2] for name in needed_modules()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    several = {"planeedges", "spaceedges", "similarities", "sights"}
+    assert several & set(done.stdout.split()) == names

@@ -50,8 +50,10 @@ class GraphState(NamedTuple):
     points: Array
 
 
-def import_group(group: Group) -> None:
-    """Import what is compiled for poses of one group alone."""
+def import_group(group: Group, with_sights: bool = False) -> None:
+    """Import what is compiled for poses of one group alone, and for sights of landmarks."""
+    if with_sights:
+        import odomap.backend.graphs.sights
     if group == "SE2":
         import odomap.backend.graphs.planeedges
     elif group == "SE3":
