@@ -62,8 +62,10 @@ if TYPE_CHECKING:
     from odomap.geometry.robust import Loss
     from odomap.geometry.trajectory import Trajectory
     from odomap.localize import continue_map, localize
+    from odomap.maps.atlas import Atlas
     from odomap.maps.estimate import Estimate, Status
     from odomap.maps.map import Map
+    from odomap.merge import Merged, merge_maps
     from odomap.run import run
     from odomap.sensors.frame import Frame
     from odomap.sensors.rig import Rig
@@ -84,6 +86,7 @@ __all__ = [
     "Adjustment",
     "AdjustmentConfig",
     "AdjustmentSolution",
+    "Atlas",
     "CalibrationError",
     "Camera",
     "Certificate",
@@ -97,6 +100,7 @@ __all__ = [
     "Loss",
     "Map",
     "MapFile",
+    "Merged",
     "MissingExtra",
     "MonocularVO",
     "OdomapError",
@@ -132,6 +136,7 @@ __all__ = [
     "joint_covariance",
     "load_map",
     "localize",
+    "merge_maps",
     "open",
     "preset",
     "read_bal",
@@ -160,6 +165,7 @@ _HOMES = {
     "Adjustment": "backend.adjustment.adjust",
     "AdjustmentConfig": "backend.adjustment.adjust",
     "AdjustmentSolution": "backend.adjustment.adjust",
+    "Atlas": "maps.atlas",
     "CalibrationError": "errors",
     "Camera": "geometry.camera",
     "Certificate": "backend.graphs.certificate",
@@ -173,6 +179,7 @@ _HOMES = {
     "Loss": "geometry.robust",
     "Map": "maps.map",
     "MapFile": "files.mapfile",
+    "Merged": "merge",
     "MissingExtra": "errors",
     "MonocularVO": "system.odometry",
     "OdomapError": "errors",
@@ -210,6 +217,7 @@ _HOMES = {
     "joint_covariance": "backend.graphs.covariances",
     "load_map": "files.mapfile",
     "localize": "localize",
+    "merge_maps": "merge",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
