@@ -131,6 +131,16 @@ def test_solution_of_exercise_2(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_solution_of_exercise_5(tmp_path):
+    picture = tmp_path / "loop.png"
+    recording = "sim:room?seed=4&frames=52&sensors=mono,depth&speed=6"
+    errors = main_of("exercise_5_solution.py")(recording, str(picture))
+    assert errors["loops"] < 0.5 * errors["odometry"]
+    assert errors["and a false one"] > 10 * errors["odometry"]
+    assert errors["the same, GNC"] < 0.5 * errors["odometry"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
 def readme_block(language: str, containing: str) -> str:
     blocks = (ROOT / "README.md").read_text().split("```")[1::2]
     found = [b for b in blocks if b.startswith(language) and containing in b]

@@ -143,7 +143,7 @@ def test_an_example_prints_what_is_shown(name):
         (BACK_END, range(12, 18)),
         (ORB_SLAM, range(18, 24)),
         (PLACES, range(24, 25)),
-        (LOOPS, range(25, 28)),
+        (LOOPS, range(25, 30)),
     ],
 )
 def test_all_examples_of_a_chapter_are_shown(page, numbers):
@@ -245,6 +245,19 @@ def test_a_loop_makes_surer_once():
     assert 20 * sigma[1] < sigma[0]
     assert max(nees[:2]) < 1.3
     assert nees[2] > 10.0
+
+
+def test_a_camera_finds_itself_in_a_saved_map():
+    results = ran("28_localise_in_a_map.py")[0]
+    assert results["lost"] == 4
+    assert results["off_mm"] < 50.0
+
+
+def test_two_maps_become_one():
+    results = ran("29_merge_maps.py")[0]
+    assert results["places"] >= 10
+    assert results["off"] < 20.0
+    assert results["merged"] < 1.5 * max(results["first"], results["second"])
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])

@@ -81,7 +81,14 @@ def surer() -> Figure:
     return figure
 
 
-FIGURES: tuple[Callable[[], Figure], ...] = (loop_steps, scale_drift, surer)
+def exercise_5() -> Figure:
+    """What the solution of the exercise finds."""
+    names = example("exercise_5_solution")
+    figure: Figure = names["draw"](*names["answer"]()[1:])
+    return figure
+
+
+FIGURES: tuple[Callable[[], Figure], ...] = (loop_steps, scale_drift, surer, exercise_5)
 
 
 def main(names: list[str]) -> None:
