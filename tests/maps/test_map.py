@@ -359,3 +359,31 @@ def test_threads_share_a_map():
     assert not errors
     assert m.num_landmarks == 150
     assert m.keyframe_ids.tolist() == [*range(21), *range(26, 30)]
+
+
+def test_landmarks_settle_in_their_anchors_unless_others_have_moved_them():
+    m, ids = chain(4)
+    snapshot = m.snapshot(m.keyframe_ids)
+    read = {k: n for n, k in enumerate(snapshot.landmark_ids.tolist())}
+    anchors, before = snapshot.anchors, snapshot.points_anchor
+    world = m.points_world(snapshot.landmark_ids)
+    np.testing.assert_array_equal(anchors, np.repeat(np.arange(4), 5))
+    moved, fused, survivor, gone, hangs = ids[1, 0], ids[1, 1], ids[1, 2], ids[1, 3], ids[3, 0]
+    places = m.points_world([moved]) + 1.0
+    m.apply(update(m, [], np.zeros((0, 4, 4)), landmark_ids=ids[1, :1], points_world=places))
+    m.fuse_landmarks([survivor], [fused])
+    m.remove_landmarks([gone])
+    m.cull_keyframes([3])  # what it held hangs from another one now
+    epoch, version = m.epoch, m.version
+    m.settle(snapshot.landmark_ids, anchors, before, before + 0.5)
+    assert m.epoch == epoch + 1
+    assert m.version == version + 1
+    np.testing.assert_allclose(m.points_world([moved]), places)
+    np.testing.assert_allclose(m.points_world([hangs])[0], world[read[hangs]])
+    assert not m.is_alive([gone])[0]
+    after = m.snapshot([0, 1])
+    now = {k: n for n, k in enumerate(after.landmark_ids.tolist())}
+    settled = [k for k in ids[:3].ravel().tolist() if k not in (moved, fused, gone)]
+    rows = [now[k] for k in settled if k in now], [read[k] for k in settled if k in now]
+    np.testing.assert_array_equal(after.points_anchor[rows[0]], before[rows[1]] + 0.5)
+    assert survivor in settled
