@@ -54,11 +54,17 @@ class Adjust:
 
     def __init__(self, log, size=40, lasts=lambda keyframe_id: 0.0):
         self.log, self.size, self.lasts = log, size, lasts
-        self.stopped = []
+        self.stopped, self.due = [], None
 
-    def add(self, keyframe):
+    def add(self, keyframe, has_closed):
+        if not has_closed:
+            return None
         self.log.append(("adjuster begins", keyframe.id))
         return AdjustJob(self, keyframe.id)
+
+    def end(self):
+        k, self.due = self.due, None
+        return None if k is None else AdjustJob(self, k)
 
 
 class AdjustJob:
@@ -255,3 +261,14 @@ def test_live_it_is_written_when_it_is_solved():
 def test_settings_that_cannot_be_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         AdjustingConfig(**wrong)
+
+
+@pytest.mark.parametrize("worker", [InlineWorker, LockstepWorker, LiveWorker])
+def test_what_is_due_at_the_end_is_done(worker):
+    run, log = make(at=(), worker=worker)
+    for frame in frames(8):
+        run.advance(frame)
+    run.stages.adjuster.due = 2
+    run.finish()
+    assert log[-3:] == written(2, 0, 1, 2)
+    assert not [t for t in threading.enumerate() if t.name.startswith("odomap")]

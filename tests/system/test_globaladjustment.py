@@ -27,7 +27,7 @@ def adjuster_of(w, bias=0.0, **how):
 
 
 def job_of(w, **how):
-    job = adjuster_of(w, **how).add(w.map.keyframe(0))
+    job = adjuster_of(w, after=0, **how).add(w.map.keyframe(0), has_closed=True)
     job.read()
     return job
 
@@ -189,3 +189,19 @@ def test_slam_adjusts_where_it_closes_loops(closing, adjusting):
     stages = Slam(rig, config).worker.stages
     assert (stages.closer is not None) == closing
     assert (stages.adjuster is not None) == (closing and adjusting)
+
+
+def test_it_begins_some_keyframes_after_a_loop_or_at_the_end():
+    w = adjust_world(keyframes=4, landmarks=100)
+    keyframe = w.map.keyframe(0)
+
+    def begins(adjuster, *closed):
+        return [adjuster.add(keyframe, c) is not None for c in closed]
+
+    assert begins(adjuster_of(w, after=2), 0, 0, 1, 0, 0, 0, 0) == [0, 0, 0, 0, 1, 0, 0]
+    assert begins(adjuster_of(w, after=2), 1, 0, 1, 0, 0, 0) == [0, 0, 0, 0, 1, 0]
+    ended = adjuster_of(w, after=2)
+    assert ended.end() is None
+    begins(ended, 1, 0)
+    assert ended.end() is not None
+    assert ended.end() is None

@@ -8,8 +8,9 @@ cameras", T-RO 2017, section III-D.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from odomap.limits import Count, NotNegative, check_limits
+from odomap.limits import Count, Limits, NotNegative, check_limits
 
 __all__ = ["AdjustingConfig"]
 
@@ -20,6 +21,9 @@ class AdjustingConfig:
 
     enabled: bool = True
     """Whether it is; only where loops are closed (`closing.enabled`)."""
+    after: Annotated[int, Limits(least=0)] = 10
+    """Keyframes from a loop to the one at which that begins: what mapping ties of the two sides
+    meanwhile, a window's worth, is what holds the loop closed."""
     iterations: Count = 10
     """Most steps of the solver."""
     tolerance: NotNegative = 1e-3

@@ -201,20 +201,31 @@ class Sideline:
         """Whether a job is out whose change, or whose error, is there."""
         return self._future is not None and self._future.done()
 
-    def start(self, keyframe: Keyframe, reads_beside: bool) -> int:
+    def add(self, keyframe: Keyframe, has_closed: bool) -> LongJob | None:
+        """Let the stage take notice of a keyframe; give up the job that is out if it closed a loop.
+
+        Returns:
+            What is to be started, if anything is.
+        """
+        if has_closed:
+            self.drop()
+        return self._stage.add(keyframe, has_closed)
+
+    def end(self) -> LongJob | None:
+        """Return what is to be started at the end of a run, if anything is."""
+        return self._stage.end()
+
+    def start(self, job: LongJob, reads_beside: bool) -> int:
         """Begin a job, in place of the one that is out.
 
         Args:
-            keyframe: where a loop was closed.
+            job: from `add` or `end`.
             reads_beside: whether the map is copied in the stage's thread too, while it goes on.
 
         Returns:
-            The size of the job; 0 where there is nothing to do, or it is not known yet.
+            The size of the job; 0 where it is not known yet.
         """
         self.drop()
-        job = self._stage.add(keyframe)
-        if job is None:
-            return 0
         if not reads_beside:
             job.read()
         if self._thread is None:

@@ -12,7 +12,9 @@ in parts, the keyframes first: landmarks follow as they hang, and the map is who
 Observations beyond the gate are dropped. A scale of a single camera stays what it is: the farthest
 keyframe keeps its distance from the first. Covariances stay those of the essential graph: features
 err together (calibration, the same corner drifting), and a bundle that takes them for independent
-would be far too sure. When another loop is closed the job is given up, and a new one begins.
+would be far too sure. It begins some keyframes after the loop: right then few landmarks are known
+from both sides, and all that odometry errs by together can pull the loop open again. When another
+loop is closed the job is given up.
 
 Cost: some dozen steps, each O(observations) and a sparse factor; about a microsecond per
 observation and step.
@@ -93,10 +95,22 @@ class GlobalAdjuster:
         self._depth_sigma, self._bias = sigma, bias
         self.gate, self.loss = gate, Loss("huber", bundle.huber_width)
         self.config = AdjustingConfig() if config is None else config
+        self._waits: int | None = None
         self.counts = Counter[str]() if counts is None else counts
 
-    def add(self, keyframe: Keyframe) -> "GlobalJob":
-        """Begin to adjust the map as it will be when the job reads it."""
+    def add(self, keyframe: Keyframe, has_closed: bool) -> "GlobalJob | None":
+        """Take notice of a keyframe; begin some keyframes after a loop was closed."""
+        if has_closed:
+            self._waits = self.config.after
+        elif self._waits is not None:
+            self._waits -= 1
+        return self.end() if self._waits == 0 else None
+
+    def end(self) -> "GlobalJob | None":
+        """Begin to adjust the map as it will be when the job reads it, if a loop was closed."""
+        if self._waits is None:
+            return None
+        self._waits = None
         return GlobalJob(self, self._map, np.array(self._bias.value))
 
     def problem(self, snapshot: Snapshot, bias: Array) -> tuple[Adjustment, Index] | None:

@@ -23,7 +23,7 @@ from odomap.sensors.frame import Frame
 from odomap.system.background import Sideline, ThreadConfig
 from odomap.system.feed import LOOK_UP_S, Feed, Mailbox
 from odomap.system.parallel import ParallelWorker
-from odomap.system.stages import Stages
+from odomap.system.stages import LongJob, Stages
 
 __all__ = ["LiveWorker"]
 
@@ -89,9 +89,9 @@ class LiveWorker(ParallelWorker):
     def _is_adjusted(self) -> bool:
         return self._adjusting is not None and self._adjusting.is_solved
 
-    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+    def _adjust(self, adjusting: Sideline, job: LongJob) -> None:
         """Begin to adjust the whole map; it is copied beside the frames, in steps."""
-        adjusting.start(keyframe, reads_beside=True)
+        adjusting.start(job, reads_beside=True)
 
     def _hand(self, index: int, keyframe: Keyframe) -> None:
         """Give a keyframe to a stage; if it is busy it waits, in place of an older one."""

@@ -27,7 +27,7 @@ synchronous approach to reactive and real-time systems", 1991): a delay is a num
 from odomap.maps.keyframes import Keyframe
 from odomap.system.background import Sideline, ThreadConfig
 from odomap.system.parallel import ParallelWorker
-from odomap.system.stages import Stages
+from odomap.system.stages import LongJob, Stages
 
 __all__ = ["LockstepWorker"]
 
@@ -72,9 +72,9 @@ class LockstepWorker(ParallelWorker):
     def _is_adjusted(self) -> bool:
         return self._adjusted <= self._count
 
-    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+    def _adjust(self, adjusting: Sideline, job: LongJob) -> None:
         """Begin to adjust the whole map as it is now."""
-        size = adjusting.start(keyframe, reads_beside=False)
+        size = adjusting.start(job, reads_beside=False)
         if self._pace:
             delay = max(-(-size // self._pace), self._closing_delay)
             self._adjusted = self._count + delay

@@ -34,7 +34,7 @@ from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
 from odomap.system.background import Lane, QuickSwitching, Sideline
-from odomap.system.stages import Change, Loop, Stages, has_closed
+from odomap.system.stages import Change, LongJob, Loop, Stages, has_closed
 from odomap.system.worker import Worker, deferred_interrupt
 
 __all__ = ["ParallelWorker"]
@@ -67,7 +67,7 @@ class ParallelWorker(Worker):
         """Say whether the map adjusted is to be written from the next frame on."""
 
     @abstractmethod
-    def _adjust(self, adjusting: Sideline, keyframe: Keyframe) -> None:
+    def _adjust(self, adjusting: Sideline, job: LongJob) -> None:
         """Begin to adjust the whole map, in place of what is being adjusted."""
 
     @abstractmethod
@@ -96,19 +96,28 @@ class ParallelWorker(Worker):
         try:
             self._lend(self._write_all)
             self._take_back()
-            with deferred_interrupt() as interrupt:
-                while self._adjusting is not None and self._adjusting.is_out:
-                    if interrupt.is_set() or self._interrupt.is_set():
-                        self._adjusting.drop()
-                    elif self._adjusting.is_solved:
-                        self._lend(self._collect_adjusted)
-                        self._take_back()
-                    else:
-                        self._adjusting.wait(LOOK_UP_S)
-            self._lend(self._write_parts)
-            self._take_back()
+            if self._adjusting is not None:
+                self._finish_adjusting(self._adjusting)
         finally:
             self.close()
+
+    def _finish_adjusting(self, adjusting: Sideline) -> None:
+        """Complete what is being adjusted, or is due to be, unless Ctrl-C is pressed."""
+        with deferred_interrupt() as interrupt:
+            if not adjusting.is_out and not self._interrupt.is_set():
+                self._lend(self._write_parts)
+                self._lend(self._begin_last)
+                self._take_back()
+            while adjusting.is_out:
+                if interrupt.is_set() or self._interrupt.is_set():
+                    adjusting.drop()
+                elif adjusting.is_solved:
+                    self._lend(self._collect_adjusted)
+                    self._take_back()
+                else:
+                    adjusting.wait(LOOK_UP_S)
+        self._lend(self._write_parts)
+        self._take_back()
 
     def close(self) -> None:
         """End the threads; a job that is out is lost, unless `finish` wrote it."""
@@ -195,13 +204,28 @@ class ParallelWorker(Worker):
         with self._beside(f"{lane.name} writes"):
             change.write(self.stages.map)
         self._news.extend(change.loops)
-        if has_closed(change) and self._adjusting is not None:
-            self._parts.clear()  # what was adjusted was another path
-            with self._beside("adjust reads"):
-                self._adjust(self._adjusting, keyframe)
+        if index == len(self._lanes) - 1 and self._adjusting is not None:
+            self._notice(self._adjusting, keyframe, has_closed(change))
         self._hand(index + 1, keyframe)
 
     # ---- the whole map ----
+
+    def _notice(self, adjusting: Sideline, keyframe: Keyframe, closed: bool) -> None:
+        """Let the adjuster take notice of a keyframe that all others are done with."""
+        if closed:
+            self._parts.clear()  # what was adjusted was another path
+        job = adjusting.add(keyframe, closed)
+        if job is not None:
+            self._parts.clear()
+            with self._beside("adjust reads"):
+                self._adjust(adjusting, job)
+
+    def _begin_last(self) -> None:
+        """Begin to adjust the map if that is due at the end of a run."""
+        assert self._adjusting is not None
+        job = self._adjusting.end()
+        if job is not None:
+            self._adjusting.start(job, reads_beside=False)
 
     def _collect_adjusted(self) -> None:
         """Wait until the map is adjusted, and lay ready what is to be written."""

@@ -6,7 +6,7 @@ did, the adjuster brings the whole map into agreement:
 
     frame → Tracker.prepare, track → Estimate;  Tracker.make_keyframe → keyframe
     keyframe → Mapper.add → Job → Change;       keyframe → Closer.add → Job → Change
-    accepted loop → Adjuster.add → LongJob → LongChange
+    keyframe → Adjuster.add → LongJob → LongChange
 
 Tracking must not wait for what takes long, so the work of mapper and closer comes in three parts:
 `add` reads the map (a snapshot: short), `Job.solve` works on what was read and touches the map no
@@ -190,11 +190,17 @@ class Closer(Protocol):
 class Adjuster(Protocol):
     """Adjusts the whole map."""
 
-    def add(self, keyframe: Keyframe) -> LongJob | None:
-        """Begin, after a loop was closed at this keyframe; None if there is nothing to do.
+    def add(self, keyframe: Keyframe, has_closed: bool) -> LongJob | None:
+        """Take notice of a keyframe that the closer is done with; None if nothing is to begin.
 
-        A job that is out is given up.
+        Args:
+            keyframe: the keyframe.
+            has_closed: whether it closed a loop; a job that is out is given up then.
         """
+        ...
+
+    def end(self) -> LongJob | None:
+        """Return what is to be done since the last loop, at the end of a run; None if nothing."""
         ...
 
 

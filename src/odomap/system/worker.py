@@ -31,7 +31,7 @@ from typing import TypeVar
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
-from odomap.system.stages import Closer, Loop, Mapper, MapState, Stages, has_closed
+from odomap.system.stages import Closer, LongJob, Loop, Mapper, MapState, Stages, has_closed
 
 __all__ = [
     "InlineWorker",
@@ -198,8 +198,11 @@ class InlineWorker(Worker):
             timing["keyframe"] = timing.get("keyframe", 0.0) + 1e3 * (time.perf_counter() - start)
             self._tell("on_keyframe", self.on_keyframe, keyframe)
             self._work("map", self.stages.mapper, keyframe, timing)
-            if self._work("close", self.stages.closer, keyframe, timing):
-                self._adjust(keyframe, timing)
+            closed = self._work("close", self.stages.closer, keyframe, timing)
+            if self.stages.adjuster is not None:
+                start = time.perf_counter()
+                if self._adjust(self.stages.adjuster.add(keyframe, closed)):
+                    timing["adjust"] = 1e3 * (time.perf_counter() - start)
             estimate = replace(estimate, timing=timing)
         self._tell_map()
         return estimate
@@ -219,19 +222,18 @@ class InlineWorker(Worker):
         timing[name] = 1e3 * (time.perf_counter() - start)
         return has_closed(change)
 
-    def _adjust(self, keyframe: Keyframe, timing: dict[str, float]) -> None:
-        """Adjust the whole map, unless Ctrl-C is pressed."""
-        adjuster = self.stages.adjuster
-        start = time.perf_counter()
-        job = adjuster.add(keyframe) if adjuster is not None else None
+    def _adjust(self, job: LongJob | None) -> bool:
+        """Adjust the whole map if there is a reason, unless Ctrl-C is pressed; say whether so."""
         if job is None:
-            return
+            return False
         job.read()
         job.solve(self._interrupt).write(self.stages.map)
-        timing["adjust"] = 1e3 * (time.perf_counter() - start)
+        return True
 
     def finish(self) -> None:
-        """Do nothing but tell the last of the map: inline, every stage is at rest after a frame."""
+        """Adjust the map if that is due, and tell the last of it; the other stages are at rest."""
+        if self.stages.adjuster is not None:
+            self._adjust(self.stages.adjuster.end())
         self._tell_map()
 
 
