@@ -155,35 +155,52 @@ def test_an_empty_map_has_nothing_in_common_with_another(vocabulary):
 # ---- within a run ----
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.4])
-def test_a_piece_begun_after_a_loss_is_merged_where_the_camera_comes_back(vocabulary, unit):
-    """Lost at two thirds of a round, and on from there somewhere, in other units."""
-    with_scale, lost = unit != 1.0, 50
-    circuit = Circuit(around(90, laps=1.25), Walls.make(), seed=1)
-    search = LoopSearch(vocabulary, ENABLED)
-    closer = LoopCloser(circuit.map, search, verifier(with_scale), with_scale, ENABLED)
-    changes = []
+LOST = 50
+"""The keyframe of a round at which a new piece begins."""
+
+
+def lost_and_back(vocabulary, check, unit=1.0):
+    """Go round, lost at more than half of it, and on from there somewhere, in other units."""
+    circuit, with_scale = Circuit(around(90, laps=1.25), Walls.make(), seed=1), unit != 1.0
+    search, loops = LoopSearch(vocabulary, ENABLED), []
+    closer = LoopCloser(circuit.map, search, check, with_scale, ENABLED)
     while circuit.count < len(circuit.true):
-        if circuit.count == lost:
+        if circuit.count == LOST:
             circuit.known.clear()
-            circuit.units[lost:] *= unit
+            circuit.units[LOST:] *= unit
             circuit.step_sigma = circuit.step_sigma * np.repeat([unit, 1.0], 3)
         keyframe = circuit.add()
-        if keyframe.id == lost:
-            _leave(circuit, lost, unit)
+        if keyframe.id == LOST:
+            _leave(circuit, LOST)
         change = closer.add(keyframe).solve()
         change.write(circuit.map)
-        changes.append(change)
-    merges = [loop for change in changes for loop in change.loops if loop.merges]
-    assert len(merges) == 1
-    assert merges[0].is_accepted
+        loops += change.loops
+    return circuit, loops
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.4])
+def test_a_piece_begun_after_a_loss_is_merged_where_the_camera_comes_back(vocabulary, unit):
+    circuit, loops = lost_and_back(vocabulary, verifier(unit != 1.0), unit)
+    # The first place in common waits for another one that agrees.
+    waiting, merge = [loop for loop in loops if loop.merges or "joins two pieces" in loop.reason]
+    assert (waiting.is_accepted, merge.is_accepted) == (False, True)
+    assert waiting.keyframe_id < merge.keyframe_id
+    assert "a second place must say the same" in waiting.reason
     (piece,) = Atlas(circuit.map).pieces
-    assert piece.merged == (lost,)
+    assert piece.merged == (LOST,)
     assert rms(circuit.errors()) < 0.004 * 1.25 * 2 * np.pi * 8.0
-    np.testing.assert_allclose(circuit.map.states.scales[lost:], 1.0 / unit, rtol=0.02)
+    np.testing.assert_allclose(circuit.map.states.scales[LOST:], 1.0 / unit, rtol=0.02)
 
 
-def _leave(circuit, lost, unit):
+def test_places_that_contradict_each_other_join_no_pieces(vocabulary):
+    check = Contradictory(CAMERA, np.eye(4), PIXELS, SCALE, False, MatchConfig())
+    circuit, loops = lost_and_back(vocabulary, check)
+    assert [loop for loop in loops if "but not as the place before it" in loop.reason]
+    assert not any(loop.merges for loop in loops)
+    assert len(Atlas(circuit.map).pieces) == 2
+
+
+def _leave(circuit, lost):
     """Put the newest keyframe where it is not, as a start anew after a loss does."""
     m = circuit.map
     m.states.Ts_world_body[lost] = m.T_world_body(lost - 1) @ se3_exp(

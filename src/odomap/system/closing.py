@@ -8,7 +8,8 @@ goes from keyframe to keyframe, in two steps:
                     → the path, corrected by an essential graph (`essentialgraph`)
 
 What the first step asks of the map is written down when keyframes come (`loopsearch`). For some
-keyframes after a loop was closed nothing is looked for. Each candidate that is refused says why.
+keyframes after a loop was closed nothing is looked for. A loop that joins two pieces of the map
+waits for a second one that agrees. Each candidate that is refused says why.
 
 What is written is how keyframes move, S ← S_corrected S_read⁻¹ S_now, so that what mapping found in
 the meantime stays; then landmarks that turned out to be one are fused, and the measurement is kept
@@ -34,9 +35,16 @@ from odomap.geometry.camera import Camera
 from odomap.geometry.lie import so3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.closure import Closure, Reading, Tie, carry_covariance, read_essentials
+from odomap.system.closure import (
+    Closure,
+    Reading,
+    Tie,
+    carry_covariance,
+    edges_of,
+    read_essentials,
+)
 from odomap.system.covisibility import Acquaintance
-from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges, correct
+from odomap.system.essentialgraph import Corrected, Essentials, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
 from odomap.system.loopsides import LoopSide, read_side
 from odomap.system.revisits import Revisit
@@ -142,6 +150,7 @@ class LoopCloser:
         self._with_scale, self._config, self._on_closed = with_scale, config, on_closed
         self._asked: list[Revisit] = []
         self._since_closed: int = config.rest
+        self._waiting: Tie | None = None
         import_group("Sim3" if with_scale else "SE3")
         search.index(search.follow(map))
 
@@ -184,21 +193,35 @@ class LoopCloser:
             ends = newer.keyframe_id, matched.keyframe_id
             loop = Loop(*ends, found.T_matched_keyframe, found.num_inliers, False, found.reason)
             if found.is_accepted:
-                row = np.searchsorted(essentials.keyframe_ids, ends)
-                edge = LoopEdges(
-                    row[1:],
-                    row[:1],
-                    found.T_matched_keyframe[None],
-                    np.array([found.scale]),
-                    found.information[None],
-                )
-                corrected = correct(essentials, edge, self._with_scale)
-                if corrected.is_accepted:
+                tie = Tie(*ends, found)
+                corrected = correct(essentials, edges_of(essentials, (tie,)), self._with_scale)
+                same, reason = self._confirming(essentials, tie, corrected)
+                if not reason:
                     loops.append(_closed(loop, essentials, corrected))
-                    return loops, Closure((Tie(*ends, found),), essentials, corrected)
-                loop = replace(loop, reason=corrected.reason)
+                    return loops, Closure((tie,), essentials, corrected, same)
+                loop = replace(loop, reason=reason)
             loops.append(loop)
         return loops, None
+
+    def _confirming(
+        self, essentials: Essentials, tie: Tie, corrected: Corrected
+    ) -> tuple[tuple[Tie, ...], str]:
+        """Return what else must speak for a loop, or why it is not believed.
+
+        Where it ties two pieces of the map nothing measured before could contradict it, so that two
+        must agree: a look-alike of one place is rarely seen from another as well.
+        """
+        if not (corrected.is_accepted and corrected.is_merging.any()):
+            return (), corrected.reason
+        other, self._waiting = self._waiting, tie
+        known = set(essentials.keyframe_ids.tolist())
+        is_there = other is not None and {other.keyframe_id, other.matched_id} <= known
+        if other is None or not is_there or other.keyframe_id == tie.keyframe_id:
+            return (), "joins two pieces of the map: a second place must say the same"
+        both = correct(essentials, edges_of(essentials, (other, tie)), self._with_scale)
+        if not both.is_believed.all():
+            return (), "joins two pieces of the map, but not as the place before it"
+        return (other,), ""
 
     def _with_nodes(self, side: LoopSide) -> LoopSide:
         return side.with_nodes(self.search.nodes(side.descriptors))
@@ -208,7 +231,7 @@ class LoopCloser:
     def write(self, closure: Closure, map: Map) -> None:
         """Correct the map by a loop, and begin to look anew."""
         self.search.begin_anew(closure.write(map, self.search.known))
-        self._asked, self._since_closed = [], 0
+        self._asked, self._since_closed, self._waiting = [], 0, None
         self._tell_closed()
 
     def refresh(self, stale: list[Acquaintance], map: Map) -> None:

@@ -18,6 +18,7 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, section VII-C (loop fusion).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
 
-__all__ = ["Closure", "Reading", "Tie", "carry_covariance", "read_essentials"]
+__all__ = ["Closure", "Reading", "Tie", "carry_covariance", "edges_of", "read_essentials"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -133,6 +134,18 @@ class Tie(NamedTuple):
     keyframe_id: int
     matched_id: int
     measured: Verified
+
+
+def edges_of(essentials: Essentials, ties: Sequence[Tie]) -> LoopEdges:
+    """Return loops as edges between rows of keyframes."""
+    ids, measured = essentials.keyframe_ids, [tie.measured for tie in ties]
+    return LoopEdges(
+        np.searchsorted(ids, [tie.matched_id for tie in ties]),
+        np.searchsorted(ids, [tie.keyframe_id for tie in ties]),
+        np.array([found.T_matched_keyframe for found in measured]),
+        np.array([found.scale for found in measured]),
+        np.array([found.information for found in measured]),
+    )
 
 
 @dataclass(frozen=True, eq=False)

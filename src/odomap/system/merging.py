@@ -6,11 +6,10 @@ came there now, and geometry decides,
 
     words → revisits → verification → many measured (i, j, S_i_j) → those that agree → closure.
 
-Within a run a loop that ties two pieces is taken as it comes. Here all can be asked before any is
-believed: places of one wall of windows look alike, but do not agree on where the second map lies.
-Graduated non-convexity keeps the largest part that does, and one alone is not enough. Neighbouring
-keyframes share their landmarks, and with these their errors; so of the loops that agree only some,
-well apart, become edges, and all fuse landmarks.
+Here all can be asked before any is believed: places of one wall of windows look alike, but do not
+agree on where the second map lies. Graduated non-convexity keeps the largest part that does, and
+one alone is not enough. Neighbouring keyframes share their landmarks, and with these their errors;
+so of the loops that agree only some, well apart, become edges, and all fuse landmarks.
 
 Cost: a query and some 5 ms of geometry per keyframe, and two corrections of the path.
 
@@ -29,8 +28,8 @@ from odomap.maps.absorbing import Absorbed
 from odomap.maps.map import Map
 from odomap.maps.states import Placement, compose, inverse
 from odomap.system.closing import Verifier
-from odomap.system.closure import Closure, Tie, read_essentials
-from odomap.system.essentialgraph import Essentials, LoopEdges, correct
+from odomap.system.closure import Closure, Tie, edges_of, read_essentials
+from odomap.system.essentialgraph import correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.loopsides import LoopSide
 from odomap.system.stages import Loop
@@ -125,14 +124,14 @@ class Merger:
                 nowhere, ties, f"none of {len(refused)} candidates is a place in common"
             )
         essentials = read_essentials(merged, self._search.known).essentials()
-        found = correct(essentials, _edges(essentials, ties), self._with_scale)
+        found = correct(essentials, edges_of(essentials, ties), self._with_scale)
         believed = [tie for tie, is_true in zip(ties, found.is_believed.tolist()) if is_true]
         if len(believed) < self._config.agreeing:
             needed = f"{self._config.agreeing} needed"
             return _without(nowhere, ties, f"{len(believed)} places in common agree of {needed}")
         chosen = _apart(believed, self._config.apart)
         if len(chosen) < len(ties):
-            found = correct(essentials, _edges(essentials, chosen), self._with_scale)
+            found = correct(essentials, edges_of(essentials, chosen), self._with_scale)
             chosen = [tie for tie, is_true in zip(chosen, found.is_believed.tolist()) if is_true]
         if not chosen:
             return _without(nowhere, ties, found.reason)
@@ -173,18 +172,6 @@ class Merger:
     def _side(self, map: Map, keyframe_id: int) -> LoopSide:
         side = self._verifier.read(map, keyframe_id)
         return side.with_nodes(self._search.nodes(side.descriptors))
-
-
-def _edges(essentials: Essentials, ties: list[Tie]) -> LoopEdges:
-    """Return loops as edges between rows of keyframes."""
-    ids, measured = essentials.keyframe_ids, [tie.measured for tie in ties]
-    return LoopEdges(
-        np.searchsorted(ids, [tie.matched_id for tie in ties]),
-        np.searchsorted(ids, [tie.keyframe_id for tie in ties]),
-        np.array([found.T_matched_keyframe for found in measured]),
-        np.array([found.scale for found in measured]),
-        np.array([found.information for found in measured]),
-    )
 
 
 def _apart(ties: list[Tie], apart: int) -> list[Tie]:
