@@ -174,9 +174,9 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
     if len(theirs) != len(ours):
         yield f"{len(theirs)} cameras there, {len(ours)} here"
     if sensors == "stereo" and len(theirs) == len(ours) == 2:
-        apart = [_distance(*pair) for pair in (theirs, ours)]
-        if not np.isclose(*apart, rtol=1e-6, atol=1e-9):
-            yield f"the baseline is {apart[0]:.6g} m there, {apart[1]:.6g} m here"
+        there_m, here_m = (_distance(*pair) for pair in (theirs, ours))
+        if not np.isclose(there_m, here_m, rtol=1e-6, atol=1e-9):
+            yield f"the baseline is {there_m:.6g} m there, {here_m:.6g} m here"
     for a, b in zip(theirs, ours):
         for name, x, y in _numbers(a, b, sensors):
             same = np.shape(x) == np.shape(y) and (
