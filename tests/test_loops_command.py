@@ -32,6 +32,9 @@ class Deciding:
     def __init__(self):
         self.given = []
 
+    def last(self):
+        return None
+
     def add(self, keyframe):
         self.given.append(keyframe.id)
         return self

@@ -201,6 +201,22 @@ def test_a_place_that_is_another_one_is_no_loop(vocabulary):
     assert not any(change.loops for change in changes)
 
 
+def test_what_the_last_keyframe_points_at_is_decided_without_one_more(vocabulary):
+    circuit = Circuit(around(80), Walls.make(), seed=1)
+    closer = closer_of(circuit, vocabulary)
+    assert closer.last() is None
+    while not closer._asked:
+        closer.add(circuit.add()).solve().write(circuit.map)
+    before = circuit.errors()[-1]
+    change = closer.last().solve()
+    (loop,) = change.loops
+    assert loop.is_accepted, loop.reason
+    assert loop.keyframe_id == circuit.count - 1
+    change.write(circuit.map)
+    assert circuit.errors()[-1] < 0.5 * before
+    assert closer.last() is None
+
+
 def test_a_map_that_was_there_before_is_recognised(vocabulary):
     circuit = Circuit(around(80), Walls.make(), seed=1)
     for _ in range(55):

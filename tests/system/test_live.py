@@ -70,6 +70,9 @@ class Slow:
         self.map, self.read, self.written = map, [], []
         self.go = threading.Semaphore(0)
 
+    def last(self):
+        return None
+
     def add(self, keyframe):
         self.read.append(keyframe.id)
         return SlowJob(self, keyframe.id)

@@ -72,6 +72,9 @@ class Lift:
         self.map, self.log, self.name, self.nap, self.loops = map, log, name, nap, loops
         self.threads = set()
 
+    def last(self):
+        return None
+
     def add(self, keyframe):
         self.log.append((f"{self.name} reads", keyframe.id))
         if keyframe.id == 0:

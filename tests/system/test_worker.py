@@ -65,6 +65,9 @@ class Lift:
     def __init__(self, map, log, name, loops=()):
         self.map, self.log, self.name, self.loops = map, log, name, loops
 
+    def last(self):
+        return None
+
     def add(self, keyframe):
         self.log.append((f"{self.name} reads", keyframe.id))
         if keyframe.id == 0:
@@ -261,3 +264,25 @@ def test_a_rhythm_that_is_not_there_is_refused_by_name(rhythm):
 def test_rhythms_are_workers():
     assert list(RHYTHMS) == ["inline", "lockstep", "live"]
     assert isinstance(make()[0], Worker)
+
+
+@pytest.mark.parametrize("rhythm", RHYTHMS)
+def test_what_the_last_keyframe_points_at_is_decided_at_the_end(rhythm):
+    """A closer reads what it decides on a keyframe later: the last one has none after it."""
+
+    class Late(Lift):
+        def last(self):
+            self.log.append(("closer ends", 0))
+            self.snapshot = self.map.snapshot([1], [0])
+            return self
+
+    m, log, told = Map(), [], []
+    loop = Loop(1, 0, np.eye(4), 3, False, "3 inliers of 15 needed")
+    worker = make_worker(rhythm, Stages(m, Track(m, log), None, Late(m, log, "closer", (loop,))))
+    worker.on_loop.append(told.append)
+    for frame in frames(5):
+        worker.track(frame)
+    assert ("closer ends", 0) not in log
+    worker.finish()
+    assert log.count(("closer ends", 0)) == 1
+    assert told == [loop, loop]

@@ -132,12 +132,15 @@ class Lane:
         """
         assert self._future is None, f"{self.name}: a job is out"
         job = self._stage.add(keyframe)
-        if job is None:
-            return False
+        if job is not None:
+            self.begin(keyframe, job)
+        return job is not None
+
+    def begin(self, keyframe: Keyframe, job: Job) -> None:
+        """Solve a job in the stage's thread; the one before it must have been collected."""
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
         self.keyframe, self._future = keyframe, self._thread.submit(self._solve, job)
-        return True
 
     def _solve(self, job: Job) -> Change:
         start = time.perf_counter()

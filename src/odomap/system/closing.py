@@ -163,6 +163,16 @@ class LoopCloser:
         path = read_essentials(self._map, self.search.known) if candidates else None
         return ClosingJob(self, keyframe, news, candidates, path)
 
+    def last(self) -> "ClosingJob | None":
+        """Read both sides of the last keyframe's candidates, if it has any: none comes after it."""
+        if not self._asked:
+            return None
+        news = self.search.follow(self._map)
+        asked, self._asked = self._asked, []
+        candidates = self._read(asked)
+        path = read_essentials(self._map, self.search.known) if candidates else None
+        return ClosingJob(self, None, news, candidates, path)
+
     def _read(self, revisits: list[Revisit]) -> tuple[_Candidate, ...]:
         """Read both sides of the candidates of a keyframe, or of what is left of their groups."""
         alive, read = self._map.is_keyframe_alive, self.verifier.read
@@ -252,14 +262,14 @@ class ClosingJob:
 
     Attributes:
         closer: whose job it is; its database of places belongs to the one job that is out.
-        keyframe: the new keyframe.
+        keyframe: the new keyframe; None at the end of a run, where none is.
         news: what became of the map's keyframes.
         candidates: of the keyframe before.
         path: what it is corrected with; None without candidates.
     """
 
     closer: LoopCloser
-    keyframe: Keyframe
+    keyframe: Keyframe | None
     news: News
     candidates: tuple[_Candidate, ...]
     path: Reading | None
@@ -268,7 +278,8 @@ class ClosingJob:
         """Look for places like this one, and decide on those found at the keyframe before."""
         closer = self.closer
         stale = self.news.stale
-        closer.recognise(self.keyframe, self.news)
+        if self.keyframe is not None:
+            closer.recognise(self.keyframe, self.news)
         if self.path is None:
             return ClosingChange(closer, stale, (), None)
         loops, closure = closer.close(self.candidates, self.path.essentials())

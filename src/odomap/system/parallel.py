@@ -178,12 +178,17 @@ class ParallelWorker(Worker):
         for index, lane in enumerate(self._lanes):
             while lane.is_out:
                 self._collect(index)
+        job = self.stages.closer.last() if self.stages.closer else None
+        if job is not None and self._last is not None:
+            lane.begin(self._last, job)
+            self._collect(index)
 
     def _begin_keyframe(self) -> None:
         """Make the keyframe that the tracker asked for, and start what it asks for."""
         with self._beside("keyframe"):
             keyframe = self.stages.tracker.make_keyframe()
         if keyframe is not None:
+            self._last = keyframe
             self._news.append(keyframe)
             self._hand(0, keyframe)
 

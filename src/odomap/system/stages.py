@@ -186,6 +186,10 @@ class Closer(Protocol):
         """Read what is needed of the map; None if there is nothing to do."""
         ...
 
+    def last(self) -> Job | None:
+        """Read, at the end of a run, what the last keyframe left to do; None if nothing."""
+        ...
+
 
 class Adjuster(Protocol):
     """Adjusts the whole map."""

@@ -25,13 +25,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from types import FrameType
 from typing import TypeVar
 
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.sensors.frame import Frame
-from odomap.system.stages import Closer, LongJob, Loop, Mapper, MapState, Stages, has_closed
+from odomap.system.stages import Job, LongJob, Loop, MapState, Stages, has_closed
 
 __all__ = [
     "InlineWorker",
@@ -87,6 +88,7 @@ class Worker(ABC):
         self.beside_ms: dict[str, list[float]] = {}
         self._told_version = stages.map.version
         self._interrupt = threading.Event()
+        self._last: Keyframe | None = None
 
     @abstractmethod
     def advance(self, frame: Frame) -> Estimate:
@@ -194,11 +196,13 @@ class InlineWorker(Worker):
         start = time.perf_counter()
         keyframe = tracker.make_keyframe()
         if keyframe is not None:
+            self._last = keyframe
             timing = dict(estimate.timing)
             timing["keyframe"] = timing.get("keyframe", 0.0) + 1e3 * (time.perf_counter() - start)
             self._tell("on_keyframe", self.on_keyframe, keyframe)
-            self._work("map", self.stages.mapper, keyframe, timing)
-            closed = self._work("close", self.stages.closer, keyframe, timing)
+            mapper, closer = self.stages.mapper, self.stages.closer
+            self._work("map", partial(mapper.add, keyframe) if mapper else None, timing)
+            closed = self._work("close", partial(closer.add, keyframe) if closer else None, timing)
             if self.stages.adjuster is not None:
                 start = time.perf_counter()
                 if self._adjust(self.stages.adjuster.add(keyframe, closed)):
@@ -208,11 +212,11 @@ class InlineWorker(Worker):
         return estimate
 
     def _work(
-        self, name: str, stage: Mapper | Closer | None, keyframe: Keyframe, timing: dict[str, float]
+        self, name: str, read: Callable[[], Job | None] | None, timing: dict[str, float]
     ) -> bool:
-        """Have a stage do what there is to do for a keyframe; say whether a loop was closed."""
+        """Have a stage do what it reads that there is to do; say whether a loop was closed."""
         start = time.perf_counter()
-        job = stage.add(keyframe) if stage is not None else None
+        job = None if read is None else read()
         if job is None:
             return False
         change = job.solve()
@@ -231,9 +235,13 @@ class InlineWorker(Worker):
         return True
 
     def finish(self) -> None:
-        """Adjust the map if that is due, and tell the last of it; the other stages are at rest."""
-        if self.stages.adjuster is not None:
-            self._adjust(self.stages.adjuster.end())
+        """Decide on what the last keyframe points at, and adjust the map if that is due."""
+        last, closer, adjuster = self._last, self.stages.closer, self.stages.adjuster
+        closed = last is not None and self._work("close", closer.last if closer else None, {})
+        if adjuster is not None and last is not None:
+            if closed:
+                self._adjust(adjuster.add(last, closed))
+            self._adjust(adjuster.end())
         self._tell_map()
 
 
