@@ -50,6 +50,8 @@ Index = NDArray[np.int64]
 
 BOTH = 2.0
 """Two pixels are compared, each with its error: twice the variance of one."""
+LEAST_SPREAD = 0.01
+"""Share of an image that is covered in any case: what is smaller shows how to turn, not where."""
 WIDE = 4.0
 """Factor on the gate while the alignment is still rough."""
 
@@ -256,7 +258,8 @@ def _reason(
         (matched, inliers.matched_feature, expected.in_matched),
     ):
         covered = coverage(side.keypoints[features[features >= 0]], side.camera)
-        needed = min(config.spread, config.spread_share * coverage(pixels, side.camera))
+        enough = max(config.spread_share * coverage(pixels, side.camera), LEAST_SPREAD)
+        needed = min(config.spread, enough)
         if covered < needed:
             return (
                 f"{found} inliers cover {100 * covered:.1f} % of keyframe {side.keyframe_id}, "
