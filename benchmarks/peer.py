@@ -73,6 +73,7 @@ def run(
     prefix: Path,
     frames: int = 0,
     cv_threads: int = 0,
+    extra: tuple[str, ...] = (),
 ) -> Played:
     """Play a recording to the peer, at the pace of its sensor.
 
@@ -84,6 +85,7 @@ def run(
         prefix: of the files it writes.
         frames: how many; 0 for all.
         cv_threads: of Python's OpenCV; 0 for the script's choice.
+        extra: further options of the script.
     """
     command = [options.peer_python, str(LAUNCHER), f"{prefix}.json", str(cv_threads)]
     layout, mode = played_as
@@ -91,6 +93,7 @@ def run(
     command += _calibration(data) if layout == "tum" else []
     command += ["--vocab", str(vocabulary), "--out", str(prefix)]
     command += ["--frames", str(frames)] if frames else []
+    command += extra
     return play(command, prefix, f"ORB-SLAM3 on {data.name}")
 
 
