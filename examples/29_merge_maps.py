@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 import odomap
-from odomap.merge import merge_maps
 
 LATER_NS = 3_600_000_000_000  # the second recording is made an hour later
 
@@ -42,7 +41,7 @@ def main() -> dict[str, float]:
     both = odomap.Trajectory(stamps, np.tile(truth.Ts_world_body, (2, 1, 1)))
     first, second = mapped(rig, frames[:60]), mapped(rig, later[50:])
     results = {name: tell(name, map, both) for name, map in (("first", first), ("second", second))}
-    found = merge_maps(first, second, rig=rig)
+    found = odomap.merge_maps(first, second, rig=rig)
     print(found.summary)
     results["merged"] = tell("merged", found.map, both)
     off = truth.pose(50).inverse() @ truth.pose(0) @ odomap.SE3(found.T_first_second)
