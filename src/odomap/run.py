@@ -318,7 +318,7 @@ def _concluded(
 ) -> RunResult:
     """Make the numbers, write what is asked for."""
     metrics, found = figures(source, logbook, result, bool(state["is_mapping"]))
-    warnings = [*notes, *found]
+    metrics["warnings"] = warnings = [*notes, *found]
     metrics |= state
     if metrics["frames_dropped"]:
         came = metrics["frames"] + metrics["frames_dropped"]
