@@ -105,6 +105,18 @@ def test_without_a_loop_covariances_are_those_of_odometry_and_with_one_they_fit_
     assert 0.7 < np.mean(nees) < 1.4
 
 
+def test_steps_that_add_up_to_more_than_the_map_says_are_made_surer():
+    true = circle(60)
+    parts = essentials(drifted(true, np.random.default_rng(1)))
+    closed = loop(se3_inverse(true[0]) @ true[-1], (0, 59))
+    right = correct(parts, closed, False).covariances
+    found = correct(replace(parts, growth=4.0 * parts.growth), closed, False).covariances
+    np.testing.assert_allclose(np.trace(found[30]), np.trace(right[30]), rtol=0.15)
+    # What is less than the map says stays as it is.
+    found = correct(replace(parts, covariances=4.0 * parts.covariances), closed, False).covariances
+    np.testing.assert_allclose(np.trace(found[30]), np.trace(right[30]), rtol=0.05)
+
+
 def test_a_similarity_takes_the_drift_of_scale_away():
     true = circle(100)
     Ts = drifted(true, None, scale=0.03)

@@ -59,6 +59,8 @@ DOUBT = 5.0
 """Factor on all standard deviations while it is asked whether a loop is to be believed. What they
 do not know (a rolling shutter, images at other instants than depth) makes real paths that much
 worse: normalised errors squared of 30 to 80 per degree of freedom where true loops are closed."""
+LEAST_FACTOR = 0.1
+"""To no less than this part of their variance steps are made surer where the map says so."""
 FAR = 10
 """Steps of the tree within which covisibility says nothing that the tree does not say."""
 ITERATIONS = 20
@@ -177,7 +179,8 @@ def correct(
         Where the keyframes are then, or why none of the loops is believed.
     """
     loops = LoopEdges(*(np.concatenate(both) for both in zip(parts.loops, new)))
-    sparse, count = _graph(parts, loops, with_scale), len(new.i)
+    count = len(new.i)
+    sparse = _as_unsure_as_told(parts, _graph(parts, loops, with_scale), count)
     is_merging = _is_apart(sparse, count)
     doubts = np.full(sparse.num_edges, DOUBT**-2)
     inliers = find_inliers(sparse, doubts, stop=None if stop is None else stop.is_set)
@@ -223,6 +226,39 @@ def _graph(parts: Essentials, loops: LoopEdges, with_scale: bool) -> EssentialGr
         is_fixed=is_fixed,
         is_doubted=np.arange(len(child) + len(loops.i)) >= len(child),
     )
+
+
+def _as_unsure_as_told(parts: Essentials, graph: EssentialGraph, count: int) -> EssentialGraph:
+    """Return the graph with steps by which the path is as unsure as the map says that it is.
+
+    Errors that go on as they were are taken for a walk at random, step by step, and what the steps
+    are less sure by adds up to more than all of it. They are made surer by one factor.
+
+    Args:
+        parts: what the map says.
+        graph: tree and loops.
+        count: of the loops, the last, of which the map does not know yet.
+    """
+    is_new = np.arange(graph.num_edges) >= graph.num_edges - count
+    told = parts.covariances / (units := _units(parts.scales))
+    rows = np.flatnonzero(np.isfinite(told).all(axis=(1, 2)) & (parts.parent >= 0))
+    if not (len(rows) and np.isfinite(told[parts.root]).all()):
+        return graph
+    walk = GraphCovariances(graph.without(is_new)).marginals()[rows, :6, :6]
+    T = parts.Ts_world_body
+    Ad = se3_adjoint(se3_inverse(T[rows]) @ T[parts.root])
+    walk = walk + Ad @ parts.covariances[parts.root] @ np.swapaxes(Ad, 1, 2) / units[rows]
+    ratio = np.trace(np.linalg.solve(walk, told[rows]), axis1=1, axis2=2) / 6.0
+    factor = float(np.clip(np.median(ratio), LEAST_FACTOR, 1.0))
+    surer = np.where(graph.is_doubted, 1.0, 1.0 / factor)
+    return replace(graph, information=graph.information * surer[:, None, None])
+
+
+def _units(scales: Array) -> Array:
+    """Return what a covariance (K, 6, 6) is to be divided by for the units of its keyframe."""
+    units = np.ones((len(scales), 6))
+    units[:, :3] = scales[:, None]
+    return units[:, :, None] * units[:, None, :]
 
 
 def _with_covisibility(graph: EssentialGraph, parts: Essentials) -> EssentialGraph:
