@@ -273,7 +273,8 @@ def test_run_writes_everything_and_says_where(cli, recording, tmp_path):
     assert code == 0, err
     names = {path.name for path in (tmp_path / "a").iterdir()}
     paths = {"trajectory.tum", "trajectory_live.tum", "keyframes.tum"}
-    assert names == paths | {"map.odomap", "config.yaml", "metrics.json", "report.html"}
+    others = {"map.odomap", "config.yaml", "metrics.json", "loops.json", "report.html"}
+    assert names == paths | others
     assert "ATE RMSE" in out
     assert str(tmp_path / "a" / "report.html") in out
     m = metrics(tmp_path / "a")

@@ -145,7 +145,7 @@ def test_where_nobody_looks_there_is_no_list_and_none_of_a_run_before(world, tmp
     code, out, err = cli("loops", tmp_path)
     assert (code, out) == (2, "")
     assert "no loops were looked for in this run" in err
-    assert "--closing.enabled true" in err
+    assert "--closing.enabled false" in err
 
 
 @pytest.mark.parametrize("rhythm", ["inline", "lockstep"])

@@ -140,6 +140,7 @@ def test_interrupt_leaves_what_there_is_in_every_rhythm(world, tmp_path, rhythm)
     assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("odomap")]
 
 
+PARTS = ("reads", "solves", "writes")
 SAME = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap")
 
 
@@ -152,7 +153,8 @@ def test_lockstep_is_the_default_and_writes_the_same_bytes_again(result, tmp_pat
     for name in ("frames_dropped", "jobs_skipped", "messages_dropped"):
         assert again.metrics[name] == result.metrics[name] == 0
     beside = result.metrics["beside_ms"]
-    assert set(beside) == {"keyframe", "map reads", "map solves", "map writes"}
+    stages = {f"{stage} {part}" for stage in ("map", "close") for part in PARTS}
+    assert set(beside) == {"keyframe", *stages}
     assert beside["map solves"]["count"] == beside["map writes"]["count"] >= 1
     assert "Beside the frames" in (result.out / "report.html").read_text()
 

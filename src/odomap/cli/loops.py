@@ -64,7 +64,8 @@ def loops_file(run: Path) -> Path:
     if (run / "metrics.json").exists():
         raise InputError(
             f"{run}: has no {LOOPS_FILE}: no loops were looked for in this run; "
-            "'odomap run ... --closing.enabled true' does, without --odometry-only"
+            "'odomap run' looks for them but with --odometry-only, presets with flow, or "
+            "--closing.enabled false"
         )
     raise InputError(f"{run}: is no run: neither {LOOPS_FILE} nor metrics.json is there")
 

@@ -50,6 +50,10 @@ __all__ = [
 ]
 
 
+NO_LOOPS = ClosingConfig(enabled=False)
+"""Where landmarks are followed by optical flow: it is for speed, and describes one level only."""
+
+
 @dataclass(frozen=True)
 class Config:
     """All sections of a run."""
@@ -126,7 +130,7 @@ def _rgbd() -> Config:
 
 
 def _stereo_flow() -> Config:
-    return Config(tracking=TrackingConfig(association="flow"))
+    return Config(tracking=TrackingConfig(association="flow"), closing=NO_LOOPS)
 
 
 def _mono_flow() -> Config:
@@ -135,6 +139,7 @@ def _mono_flow() -> Config:
         tracking=TrackingConfig(sensors="mono", association="flow"),
         candidates=CandidateConfig(follow=True),
         bundle=BundleConfig(iterations=8),
+        closing=NO_LOOPS,
     )
 
 
@@ -144,6 +149,7 @@ def _rgbd_flow() -> Config:
         tracking=TrackingConfig(sensors="rgbd", association="flow"),
         candidates=CandidateConfig(follow=True),
         noise=NoiseConfig(position_px=1.2),
+        closing=NO_LOOPS,
     )
 
 

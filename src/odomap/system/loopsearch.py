@@ -41,7 +41,7 @@ Index = NDArray[np.int64]
 class ClosingConfig:
     """When loops are looked for, and closed."""
 
-    enabled: bool = False
+    enabled: bool = True
     """Whether places seen before are recognised and the path is corrected there."""
     recent: Count = 10
     """Newest keyframes that are no places seen before."""
