@@ -283,4 +283,7 @@ def test_slam_looks_for_loops_where_it_is_asked_to(room, vocabulary, rhythm):
         assert len(slam.worker.stages.closer.search.known.keyframe_ids) > 1
         assert not any(loop.is_accepted for loop in loops)
     assert len({path.Ts_world_body.tobytes() for path in paths}) == 1
-    assert Slam(room.rig, preset("stereo")).worker.stages.closer is None
+    assert Slam(room.rig, preset("stereo")).worker.stages.closer is not None
+    unasked = replace(preset("stereo"), closing=ClosingConfig(enabled=False))
+    for config in (unasked, preset("stereo-flow")):
+        assert Slam(room.rig, config).worker.stages.closer is None

@@ -240,9 +240,7 @@ def test_lost_for_long_a_new_piece_begins_and_is_merged_when_the_camera_is_back(
     journey, vocabulary, sensors
 ):
     config = replace(preset(sensors), closing=ENABLED)
-    slam, loops = Slam(journey.rig, config, vocabulary=vocabulary), []
-    slam.worker.on_loop.append(loops.append)
-    reasons = []
+    slam, reasons = Slam(journey.rig, config, vocabulary=vocabulary), []
     for frame in journey:
         estimate = slam.track(frame)
         if frame.id in DARK or frame.id > ANEW:
@@ -251,12 +249,12 @@ def test_lost_for_long_a_new_piece_begins_and_is_merged_when_the_camera_is_back(
         if frame.id == ANEW:
             assert len(Atlas(slam.map).pieces) == 2
     assert any("started anew where it was last" in reason for reason in reasons[DARK[-1] :])
-    (merge,) = [loop for loop in loops if loop.merges]
+    # From then on the keyframes of both pieces are where they were, in the units of the first.
+    result = slam.finish()
+    (merge,) = [loop for loop in result.loops if loop.merges]
     assert merge.is_accepted
     (piece,) = Atlas(slam.map).pieces
     assert len(piece.merged) == 1
-    # From then on the keyframes of both pieces are where they were, in the units of the first.
-    result = slam.finish()
     truth = result.truth(journey.truth)
     path = np.linalg.norm(np.diff(truth.Ts_world_body[:, :3, 3], axis=0), axis=1).sum()
     error = ate(result.trajectory, truth, align="sim3" if sensors == "mono" else "se3")

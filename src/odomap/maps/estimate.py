@@ -47,7 +47,8 @@ class Estimate:
         reason: a sentence a person can act on; empty when there is nothing to say.
         keyframe_id: the keyframe the pose hangs from, -1 before there is one.
         T_keyframe_body: pose relative to that keyframe, in its units.
-        T_world_body: pose in the world as known when the frame was tracked.
+        T_world_body: pose in the world as known when the frame was tracked; when lost, where it was
+            last known to be, which is no measurement: look at the status before drawing it.
         covariance: (6, 6) of T_world_body, tangent (translation, rotation), right update,
             metres and radians; relative to the first pose, which is exact.
         num_inliers: observations that agree with the pose.

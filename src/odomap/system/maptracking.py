@@ -41,6 +41,10 @@ Index = NDArray[np.int64]
 
 SHARE = 0.3
 """Part of the likely landmarks that must agree before others are looked for."""
+RECOGNISED = 2
+"""How many times the inliers of a tracked frame one that was recognised must have."""
+AGREE = 0.5
+"""Part of the landmarks found there that must agree; by chance it is a third at most."""
 FULLY = 0.9
 """A frame that shows this part of what its keyframe showed adds nothing, however late it comes."""
 STILL = 0.005
@@ -161,17 +165,17 @@ class MapTracker(Tracker[LocalMap]):
         return self._locator.locate(view, known, likely, T_world_body, needed)
 
     def _begin(self, look: Look) -> Estimate:
-        """Start; in a map that was there before, where the view is recognised."""
-        if not self._is_given:
+        """Start; in a map that was there before, where the view is recognised.
+
+        Lost in it for long, the tracker begins a new piece if it may, as in a map of its own.
+        """
+        if not self._is_given or (self._is_mapping and len(self.path)):
             return super()._begin(look)
         found = self._recognised(look.view)
         look.clock.lap("recognise")
         if isinstance(found, str):
             return self._lose(look.frame, f"not recognised: {found}", look.clock)
         known, located = found
-        if located.num_inliers < self._tracking.min_inliers:
-            reason = f"{located.num_inliers} inliers of {self._tracking.min_inliers} needed"
-            return self._lose(look.frame, f"not recognised: {reason}", look.clock)
         self._since_keyframe = 0
         return self._accept(look, known, located, Status.RECOVERED)
 
@@ -195,7 +199,13 @@ class MapTracker(Tracker[LocalMap]):
         T_world_body = found.T_world_camera @ se3_inverse(self._eye.T_body_camera)
         known = self._around(found.keyframe_id, T_world_body)
         likely = known.rows_of(found.landmark_ids)
-        return known, self._locator.locate(view, known, likely, T_world_body, 0)
+        located = self._locator.locate(view, known, likely, T_world_body, 0)
+        count, matched = located.num_inliers, len(located.rows)
+        # Near any pose some of the many landmarks there find a feature that looks like them.
+        needed = max(RECOGNISED * self._tracking.min_inliers, int(AGREE * matched))
+        if count < needed:
+            return f"{count} inliers of {needed} needed, of {matched} landmarks that were found"
+        return known, located
 
     def _accept(self, look: Look, known: LocalMap, located: Located, status: Status) -> Estimate:
         """Accept a frame, and turn to the keyframe that shares most landmarks with it."""

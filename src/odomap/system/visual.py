@@ -29,7 +29,7 @@ from odomap.system.eye import Eye
 from odomap.system.path import Path
 from odomap.system.ranging import DepthRanger, Ranger, StereoRanger
 from odomap.system.rhythms import make_worker
-from odomap.system.stages import Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.uncertainty import Calibration, NoiseConfig
 from odomap.vision.rectifier import Rectifier
 
@@ -49,6 +49,7 @@ class Result:
         T_body_tracked: (4, 4) where on the body that is what the poses are of: the identity, or
             the mount of a single camera, whose path without a scale cannot carry the lever arm.
         mapping: what local mapping did, counts by name; empty for odometry.
+        loops: places that were taken for ones seen before, accepted or not, in order.
     """
 
     trajectory: Trajectory
@@ -58,6 +59,7 @@ class Result:
     is_metric: bool = True
     T_body_tracked: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     mapping: Mapping[str, int] = field(default_factory=dict)
+    loops: tuple[Loop, ...] = ()
 
     def truth(self, truth: Trajectory) -> Trajectory:
         """Return a ground truth of the body as one of what was tracked."""
@@ -136,6 +138,8 @@ class VisualSystem(ABC):
         self._sight = sight
         stages = self._stages(sight, config)
         self.worker = make_worker(rhythm, stages, config.threads)
+        self._loops: list[Loop] = []
+        self.worker.on_loop.append(self._loops.append)
 
     @abstractmethod
     def _stages(self, sight: Sight, config: Config) -> Stages:
@@ -172,6 +176,7 @@ class VisualSystem(ABC):
             self._sight.ranger is not None,
             self._sight.T_body_tracked,
             self._counts(),
+            tuple(self._loops),
         )
 
     def _counts(self) -> Mapping[str, int]:
