@@ -12,8 +12,9 @@ from odomap.maps.atlas import Atlas
 from odomap.maps.estimate import Status
 from odomap.maps.map import Map
 from odomap.simulation.world import World
-from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.closing import LoopCloser, SideVerifier, strayed
 from odomap.system.config import preset
+from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.merging import MergeConfig, Merger
 from odomap.system.slam import Slam
@@ -259,3 +260,32 @@ def test_lost_for_long_a_new_piece_begins_and_is_merged_when_the_camera_is_back(
     path = np.linalg.norm(np.diff(truth.Ts_world_body[:, :3, 3], axis=0), axis=1).sum()
     error = ate(result.trajectory, truth, align="sim3" if sensors == "mono" else "se3")
     assert error.rmse < 0.004 * path
+
+
+@pytest.mark.parametrize(
+    ("with_scale", "metres", "radians", "said"),
+    [
+        (False, 1.0, 0.5, ""),
+        (False, 9.0, 0.0, "9 away and 0° turned"),
+        (False, 0.0, 3.0, "0 away and 172° turned"),
+        (True, 9.0, 0.5, ""),
+        (True, 0.0, 3.0, "172° turned"),
+    ],
+)
+def test_no_piece_is_moved_further_than_its_camera_can_have_come(with_scale, metres, radians, said):
+    """The newer piece is unsure by a metre and half a radian: it was lost for a second."""
+    Ts = np.stack([np.eye(4)] * 2)
+    none = LoopEdges(*(np.zeros((0, *shape)) for shape in ((), (), (4, 4), (), (6, 6))))
+    sure = np.stack([1e-6 * np.eye(6), np.diag([1.0] * 3 + [0.25] * 3)])
+    before = Essentials(
+        np.arange(2), Ts, np.ones(2), sure, np.full(2, -1), sure, np.zeros((0, 2), int), none, 0
+    )
+    moved = Ts.copy()
+    moved[1] = se3_exp(np.array([metres, 0, 0, 0, radians, 0]))
+    moved[1, :3, 3] = metres, 0, 0
+    after = Corrected(moved, np.ones(2), None, True, is_merging=np.ones(1, bool))
+    reason = strayed(1, 0, before, after, with_scale)
+    assert said in reason
+    assert bool(reason) == bool(said)
+    unknown = replace(before, covariances=np.full((2, 6, 6), np.nan))  # a map that was taken in
+    assert not strayed(1, 0, unknown, after, with_scale)

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.graphs.graphproblem import import_group
 from odomap.geometry.camera import Camera
-from odomap.geometry.lie import so3_log
+from odomap.geometry.lie import se3_inverse, se3_log, so3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import (
@@ -58,10 +58,14 @@ __all__ = [
     "LoopCloser",
     "SideVerifier",
     "Verifier",
+    "strayed",
 ]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+ASTRAY = 5.0
+"""Standard deviations of where a camera unseen may be beyond which it has not moved by itself."""
 
 
 class Verifier(Protocol):
@@ -219,10 +223,14 @@ class LoopCloser:
         """Return what else must speak for a loop, or why it is not believed.
 
         Where it ties two pieces of the map nothing measured before could contradict it, so that two
-        must agree: a look-alike of one place is rarely seen from another as well.
+        must agree: a look-alike of one place is rarely seen from another as well. And the camera
+        must have been able to get there while it was lost.
         """
         if not (corrected.is_accepted and corrected.is_merging.any()):
             return (), corrected.reason
+        ends = tie.keyframe_id, tie.matched_id
+        if reason := strayed(*ends, essentials, corrected, self._with_scale):
+            return (), reason
         other, self._waiting = self._waiting, tie
         known = set(essentials.keyframe_ids.tolist())
         is_there = other is not None and {other.keyframe_id, other.matched_id} <= known
@@ -322,6 +330,32 @@ def _closed(loop: Loop, before: Essentials, after: Corrected) -> Loop:
         turned=float(np.linalg.norm(so3_log(T[:3, :3].T @ T_new[:3, :3]))),
         rescaled=float(after.scales[k] / before.scales[k]),
     )
+
+
+def strayed(
+    keyframe_id: int, matched_id: int, before: Essentials, after: Corrected, with_scale: bool
+) -> str:
+    """Say if a merge moves a piece further than its covariance allows, which grew in the gap.
+
+    A single camera's pieces differ in scale, so that only how it turned is held against it. Where
+    nothing is known of the covariance, as of a map that was taken in, nothing is.
+    """
+    rows = np.searchsorted(before.keyframe_ids, (keyframe_id, matched_id))
+    Ts, Ts_new = before.Ts_world_body[rows], after.Ts_world_body[rows]
+    moved = se3_log(se3_inverse(Ts) @ Ts_new)
+    k = int(np.argmax(np.linalg.norm(moved, axis=1)))  # the end in the piece that is moved
+    used = slice(3, 6) if with_scale else slice(0, 6)
+    xi, covariance = moved[k, used], before.covariances[rows[k]][used, used]
+    if not np.isfinite(covariance).all():
+        return ""
+    distance = float(np.sqrt(xi @ np.linalg.pinv(covariance, hermitian=True) @ xi))
+    if distance <= ASTRAY:
+        return ""
+    metres, degrees = np.linalg.norm(moved[k, :3]), np.degrees(np.linalg.norm(moved[k, 3:]))
+    where = (
+        f"{degrees:.0f}° turned" if with_scale else f"{metres:.2g} away and {degrees:.0f}° turned"
+    )
+    return f"joins two pieces of the map, but {where}: further than the camera can have come unseen"
 
 
 def _log(loops: list[Loop]) -> None:

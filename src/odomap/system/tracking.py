@@ -73,6 +73,8 @@ ASTRAY = 5.0
 """Standard deviations of where a body unseen may be beyond which it has not moved by itself."""
 WELL = 2
 """How many times the inliers needed must be settled for that to be believed."""
+SHOWS = 0.15
+"""Part of the landmarks expected there that must show, further off than one such deviation."""
 CLEARLY = 1.5
 """How many times the settled landmarks of the tracked pose must agree with another to win."""
 
@@ -355,7 +357,11 @@ class Tracker(ABC, Generic[K]):
         settled, least = self._count_settled(known, located), self._tracking.min_inliers
         if self._veil.is_shown and settled < least:  # the others may be on what hides the known
             return False
-        return bool(moved <= ASTRAY * sigma) or settled >= WELL * least
+        if moved <= sigma:
+            return True
+        # One of many identical doors looks right, but not what must show around it.
+        shows = located.num_inliers >= SHOWS * located.expected
+        return shows and (bool(moved <= ASTRAY * sigma) or settled >= WELL * least)
 
     def _count_settled(self, known: K, located: Located) -> int:
         """Count the settled landmarks that agree with a pose."""
