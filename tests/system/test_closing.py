@@ -15,7 +15,7 @@ from odomap.system.config import preset
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.slam import Slam
 from odomap.vision.matching import MatchConfig
-from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
+from system.circuits import CAMERA, PIXELS, SCALE, STEP, Circuit, Walls, around
 
 ENABLED = ClosingConfig(enabled=True)
 
@@ -154,6 +154,19 @@ def test_a_mapper_that_began_before_does_not_undo_what_a_loop_says_of_certainty(
     np.testing.assert_allclose(circuit.map.covariance(keyframe.id), carried, atol=1e-12)
     assert len(told) == 2
     assert np.trace(carried) < 0.5 * np.trace(unaware)
+
+
+def test_a_keyframe_that_was_mapped_before_a_loop_is_written_keeps_what_odometry_said(vocabulary):
+    circuit = Circuit(around(80), Walls.make(), seed=1)
+    closer = closer_of(circuit, vocabulary)
+    change = go_until_closed(circuit, closer)
+    keyframe = circuit.add()  # and nobody says anything of it any more
+    change.write(circuit.map)
+    carried = circuit.map.covariance(keyframe.id)
+    closer.add(keyframe).solve().write(circuit.map)
+    np.testing.assert_array_equal(circuit.map.covariance(keyframe.id), carried)
+    growth = closer.search.known.growth[keyframe.id]
+    np.testing.assert_allclose(growth, np.diag(np.maximum(STEP, 1e-4) ** 2), atol=1e-9)
 
 
 class Mistaken(SideVerifier):

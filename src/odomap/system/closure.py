@@ -32,7 +32,7 @@ from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
 from odomap.maps.states import compose, inverse, stretched
 from odomap.system.correction import correction
-from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
+from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
 
@@ -164,7 +164,7 @@ class Closure:
     after: Corrected
     fused: tuple[Tie, ...] = ()
 
-    def write(self, map: Map, known: Covisibility) -> dict[int, Array]:
+    def write(self, map: Map, known: Covisibility) -> dict[int, Carried]:
         """Move the keyframes, fuse what is one, and keep the measurement.
 
         Args:
@@ -172,8 +172,8 @@ class Closure:
             known: keyframes that are not in it have come since.
 
         Returns:
-            Of those how sure their parents were before, in units as of now: what a mapper that
-            began before finds out about how sure they are is relative to that.
+            Of those how sure their parents were before, in units as of now, and what both are now:
+            what a mapper that began before still says of them is relative to the former.
         """
         ids = map.keyframe_ids
         came = [acquaint(map, k) for k in ids[~np.isin(ids, known.keyframe_ids)].tolist()]
@@ -187,7 +187,10 @@ class Closure:
         for newer, matched, found in self.ties:
             T, scale = found.T_matched_keyframe, found.scale
             map.add_edge(matched, newer, T, found.information, LOOP, scale_i_j=scale)
-        return {k: stretched(sure, map.scale(parents[k]) / of) for k, (sure, of) in were.items()}
+        return {
+            k: Carried(stretched(sure, map.scale(p) / of), map.covariance(p), map.covariance(k))
+            for (k, p), (sure, of) in zip(parents.items(), were.values())
+        }
 
     def _update(self, map: Map) -> Update:
         """Return the correction, applied to where keyframes are now."""

@@ -27,7 +27,7 @@ from odomap.maps.columns import grown
 from odomap.maps.map import Map
 from odomap.maps.states import Placement, compose, inverse, stretched
 
-__all__ = ["Acquaintance", "Covisibility", "acquaint"]
+__all__ = ["Acquaintance", "Carried", "Covisibility", "acquaint"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -53,6 +53,20 @@ class Acquaintance(NamedTuple):
     T_parent_keyframe: Array
     scale_parent_keyframe: float
     growth: Array
+
+
+class Carried(NamedTuple):
+    """How sure a loop made a keyframe that came while it was solved.
+
+    Attributes:
+        parent_before: (6, 6) covariance of its parent before the loop, in units as of after it.
+        parent: (6, 6) the same after it.
+        own: (6, 6) of the keyframe, which follows from that.
+    """
+
+    parent_before: Array
+    parent: Array
+    own: Array
 
 
 class Covisibility:

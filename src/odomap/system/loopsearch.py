@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from odomap.limits import Count, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
+from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
 from odomap.system.revisits import Revisit, RevisitConfig, Revisits
 from odomap.vision.places import Places
 from odomap.vision.vocabulary import VocabularyTree
@@ -96,7 +96,7 @@ class LoopSearch:
         self.known = Covisibility(config.min_shared, config.strong_shared)
         self._places = Places(vocabulary.num_words)
         self._revisits = Revisits(self._places, revisits)
-        self._were: dict[int, Array] = {}
+        self._carried: dict[int, Carried] = {}
 
     def follow(self, map: Map) -> News:
         """Write down which keyframes of a map went and came."""
@@ -107,9 +107,12 @@ class LoopSearch:
             self.known.cull(k)
         stale = []
         for k in come:
-            were = self._were.pop(k, None)
-            self.known.add(keyframe := acquaint(map, k, were))
-            stale += [] if were is None else [keyframe]
+            carried, of_parent, is_stale = self._carried.pop(k, None), None, False
+            if carried is not None:  # a mapper that did not know of the loop may have spoken since
+                is_stale = not np.array_equal(carried.own, map.covariance(k), equal_nan=True)
+                of_parent = carried.parent_before if is_stale else carried.parent
+            self.known.add(keyframe := acquaint(map, k, of_parent))
+            stale += [keyframe] if is_stale else []
         recent = alive[-self._config.recent :]
         return News(gone, [map.keyframe(k) for k in come], stale, recent)
 
@@ -141,13 +144,13 @@ class LoopSearch:
         """Return the (N,) nodes of (N, 32) descriptors in the direct index."""
         return self._vocabulary.transform(descriptors).nodes
 
-    def begin_anew(self, were: dict[int, Array]) -> None:
+    def begin_anew(self, carried: dict[int, Carried]) -> None:
         """Forget what places were pointed at: a loop was closed.
 
         Args:
-            were: how sure the parents were of keyframes that came since it was found.
+            carried: how sure it made keyframes that came since it was found.
         """
-        self._were.update(were)
+        self._carried.update(carried)
         self._revisits.forget()
 
 
