@@ -10,14 +10,17 @@ from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.lie import se3_exp, se3_inverse
 from odomap.maps.atlas import Atlas
 from odomap.maps.estimate import Status
+from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.simulation.world import World
 from odomap.system.closing import LoopCloser, SideVerifier, strayed
+from odomap.system.closure import Tie, edges_of, read_essentials
 from odomap.system.config import preset
-from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
+from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.merging import MergeConfig, Merger
 from odomap.system.slam import Slam
+from odomap.system.verifying import Verified
 from odomap.vision.matching import MatchConfig
 from system.circuits import CAMERA, PIXELS, SCALE, Circuit, Walls, around
 
@@ -199,6 +202,31 @@ def test_places_that_contradict_each_other_join_no_pieces(vocabulary):
     assert [loop for loop in loops if "but not as the place before it" in loop.reason]
     assert not any(loop.merges for loop in loops)
     assert len(Atlas(circuit.map).pieces) == 2
+
+
+def test_a_place_that_joins_two_pieces_says_nothing_about_a_third(vocabulary):
+    m = Map()
+    for n in range(15):
+        T = np.eye(4)
+        T[0, 3] = n
+        keyframe = Keyframe(m.new_keyframe_id(), n)
+        m.add_keyframe(keyframe, T, covariance=(1e-6 * n + 9.0 * (n // 5)) * np.eye(6))
+        if n % 5 == 0:
+            m.begin_piece(n)
+    closer = LoopCloser(m, LoopSearch(vocabulary, ENABLED), verifier(), False, ENABLED)
+    path = read_essentials(m, closer.search.known).essentials()
+
+    def confirming(newer, matched):
+        found = Verified(np.eye(4), 1.0, 1e4 * np.eye(6), 50, np.empty((0, 2), np.int64), "")
+        tie = Tie(newer, matched, found)
+        return closer._confirming(path, tie, correct(path, edges_of(path, (tie,)), False))
+
+    assert confirming(7, 2) == ((), "joins two pieces of the map: a second place must say the same")
+    others, reason = confirming(12, 3)
+    assert not others
+    assert "the place before it two others" in reason
+    (before,), reason = confirming(13, 4)
+    assert (before.keyframe_id, reason) == (12, "")
 
 
 def _leave(circuit, lost):

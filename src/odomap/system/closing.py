@@ -41,6 +41,7 @@ from odomap.system.closure import (
     Tie,
     carry_covariance,
     edges_of,
+    pieces_of,
     read_essentials,
 )
 from odomap.system.covisibility import Acquaintance
@@ -160,22 +161,19 @@ class LoopCloser:
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":
         """Take in a keyframe that is in the map, and read both sides of the last candidates."""
-        news = self.search.follow(self._map)
         self._since_closed += 1
+        return self._job(keyframe)
+
+    def last(self) -> "ClosingJob | None":
+        """Read both sides of the last keyframe's candidates, if it has any: none comes after it."""
+        return self._job(None) if self._asked else None
+
+    def _job(self, keyframe: Keyframe | None) -> "ClosingJob":
+        news = self.search.follow(self._map)
         asked, self._asked = self._asked, []
         candidates = self._read(asked)
         path = read_essentials(self._map, self.search.known) if candidates else None
         return ClosingJob(self, keyframe, news, candidates, path)
-
-    def last(self) -> "ClosingJob | None":
-        """Read both sides of the last keyframe's candidates, if it has any: none comes after it."""
-        if not self._asked:
-            return None
-        news = self.search.follow(self._map)
-        asked, self._asked = self._asked, []
-        candidates = self._read(asked)
-        path = read_essentials(self._map, self.search.known) if candidates else None
-        return ClosingJob(self, None, news, candidates, path)
 
     def _read(self, revisits: list[Revisit]) -> tuple[_Candidate, ...]:
         """Read both sides of the candidates of a keyframe, or of what is left of their groups."""
@@ -236,6 +234,9 @@ class LoopCloser:
         is_there = other is not None and {other.keyframe_id, other.matched_id} <= known
         if other is None or not is_there or other.keyframe_id == tie.keyframe_id:
             return (), "joins two pieces of the map: a second place must say the same"
+        other_pieces, pieces = pieces_of(essentials, (other, tie))
+        if other_pieces != pieces:
+            return (), "joins two pieces of the map, and the place before it two others"
         both = correct(essentials, edges_of(essentials, (other, tie)), self._with_scale)
         if not both.is_believed.all():
             return (), "joins two pieces of the map, but not as the place before it"

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.backend.graphs.components import connected_components
 from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.maps.atlas import beginnings
 from odomap.maps.edges import LOOP
@@ -36,7 +37,15 @@ from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acqu
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
 from odomap.system.verifying import Verified
 
-__all__ = ["Closure", "Reading", "Tie", "carry_covariance", "edges_of", "read_essentials"]
+__all__ = [
+    "Closure",
+    "Reading",
+    "Tie",
+    "carry_covariance",
+    "edges_of",
+    "pieces_of",
+    "read_essentials",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -146,6 +155,15 @@ def edges_of(essentials: Essentials, ties: Sequence[Tie]) -> LoopEdges:
         np.array([found.scale for found in measured]),
         np.array([found.information for found in measured]),
     )
+
+
+def pieces_of(essentials: Essentials, ties: Sequence[Tie]) -> list[frozenset[int]]:
+    """Return of each loop which parts it joins of what tree and earlier loops tie."""
+    ids, loops, child = essentials.keyframe_ids, essentials.loops, essentials.parent >= 0
+    first = np.concatenate([essentials.parent[child], loops.i])
+    second = np.concatenate([np.flatnonzero(child), loops.j])
+    label, new = connected_components(len(ids), first, second), edges_of(essentials, ties)
+    return [frozenset(ends) for ends in zip(label[new.i].tolist(), label[new.j].tolist())]
 
 
 @dataclass(frozen=True, eq=False)
