@@ -105,7 +105,7 @@ class Merger:
         self._verifier, self._with_scale = verifier, with_scale
         self._closing = ClosingConfig() if closing is None else closing
         self._config = MergeConfig() if config is None else config
-        self._search = LoopSearch(vocabulary, self._closing)
+        self._vocabulary = vocabulary
 
     def merge(self, first: Map, second: Map, tell: Tell | None = None) -> Merging:
         """Merge two maps; neither is changed.
@@ -116,14 +116,14 @@ class Merger:
             tell: told of every keyframe of the second that is looked up.
         """
         merged = Map.restored(first.dump())
-        absorbed = merged.absorb(second)
-        ties, refused = self._compared(merged, absorbed, tell or (lambda *_: None))
+        absorbed, search = merged.absorb(second), LoopSearch(self._vocabulary, self._closing)
+        ties, refused = self._compared(merged, absorbed, search, tell or (lambda *_: None))
         nowhere = Merging(merged, absorbed, tuple(refused), np.eye(4))
         if not ties:
             return _without(
                 nowhere, ties, f"none of {len(refused)} candidates is a place in common"
             )
-        essentials = read_essentials(merged, self._search.known).essentials()
+        essentials = read_essentials(merged, search.known).essentials()
         found = correct(essentials, edges_of(essentials, ties), self._with_scale)
         believed = [tie for tie, is_true in zip(ties, found.is_believed.tolist()) if is_true]
         if len(believed) < self._config.agreeing:
@@ -137,7 +137,7 @@ class Merger:
             return _without(nowhere, ties, found.reason)
         before, landmarks = _placed(merged, absorbed.root_id), merged.num_landmarks
         others = tuple(tie for tie in believed if tie not in chosen)
-        Closure(tuple(chosen), essentials, found, others).write(merged, self._search.known)
+        Closure(tuple(chosen), essentials, found, others).write(merged, search.known)
         T, scale = compose(_placed(merged, absorbed.root_id), inverse(before))
         true = {id(tie) for tie in believed}
         loops = [_loop(tie, id(tie) in true) for tie in ties] + refused
@@ -146,10 +146,10 @@ class Merger:
         return Merging(merged, absorbed, tuple(loops), T, float(scale), fused)
 
     def _compared(
-        self, merged: Map, absorbed: Absorbed, tell: Tell
+        self, merged: Map, absorbed: Absorbed, search: LoopSearch, tell: Tell
     ) -> tuple[list[Tie], list[Loop]]:
         """Look every keyframe of the second up among those of the first; let geometry decide."""
-        search, ids = self._search, absorbed.keyframe_ids
+        ids = absorbed.keyframe_ids
         news = search.follow(merged)
         search.index(news._replace(come=[k for k in news.come if k.id < absorbed.offset]))
         ties: list[Tie] = []
@@ -157,10 +157,10 @@ class Merger:
         for done, k in enumerate(ids.tolist()):
             tell(done, len(ids), f"{len(ties)} places in common")
             revisits = search.find(merged.keyframe(k), ids)[: self._closing.most]
-            newer = self._side(merged, k) if revisits else None
+            newer = self._side(merged, k, search) if revisits else None
             for revisit in revisits:
                 assert newer is not None
-                matched = self._side(merged, revisit.matched_id)
+                matched = self._side(merged, revisit.matched_id, search)
                 found = self._verifier.verify(newer, matched, k)
                 tie = Tie(k, revisit.matched_id, found)
                 if found.is_accepted:
@@ -169,9 +169,9 @@ class Merger:
                 refused.append(_loop(tie, False, found.reason))
         return ties, refused
 
-    def _side(self, map: Map, keyframe_id: int) -> LoopSide:
+    def _side(self, map: Map, keyframe_id: int, search: LoopSearch) -> LoopSide:
         side = self._verifier.read(map, keyframe_id)
-        return side.with_nodes(self._search.nodes(side.descriptors))
+        return side.with_nodes(search.nodes(side.descriptors))
 
 
 def _apart(ties: list[Tie], apart: int) -> list[Tie]:
