@@ -239,6 +239,16 @@ def test_ctrl_c_gives_it_up(when):
     assert not [e for e in log if e[0] == "adjuster writes"]
 
 
+def test_ctrl_c_while_it_is_completed_is_told_to_whoever_runs_it():
+    worker, _ = make(size=10_000, lasts=lambda k: 60.0)
+    interrupt = threading.Event()
+    for frame in worker.frames(frames(10), interrupt):
+        worker.advance(frame)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    worker.finish()
+    assert interrupt.is_set()
+
+
 def test_what_the_adjuster_raises_is_raised():
     worker, _ = make(lasts=lambda k: 1 / 0)
     with pytest.raises(ZeroDivisionError):

@@ -110,6 +110,7 @@ class ParallelWorker(Worker):
                 self._take_back()
             while adjusting.is_out:
                 if interrupt.is_set() or self._interrupt.is_set():
+                    self._interrupt.set()  # whoever waits for the run to end is told
                     adjusting.drop()
                 elif adjusting.is_solved:
                     self._lend(self._collect_adjusted)
