@@ -207,11 +207,10 @@ def _merger(
     from odomap.system.visual import Sight
 
     eye = Sight.of(rig, config).eye
-    noise, follows = config.noise, config.tracking.association == "flow"
     verifier = SideVerifier(
         eye.camera,
         eye.T_body_camera,
-        noise.position_px if follows else noise.feature_px,
+        config.noise.feature_px,
         config.orb.scale,
         with_scale,
         config.matching,
