@@ -156,6 +156,34 @@ def test_an_empty_map_has_nothing_in_common_with_another(vocabulary):
         assert merging.reason
 
 
+class Told(Merger):
+    """A merger that is told what was compared, by keyframes of both maps."""
+
+    def _compared(self, merged, absorbed, search, tell):
+        search.follow(merged)
+        ends = (2, 2), (15, 15), (25, 7)
+        none = np.empty((0, 2), np.int64)
+        found = Verified(np.eye(4), 1.0, 1e4 * np.eye(6), 50, none, "")
+        return [Tie(absorbed.offset + i, j, found) for i, j in ends], []
+
+
+def test_a_piece_of_the_second_map_needs_two_places_of_its_own(vocabulary):
+    maps = []
+    for begin in (0, 20):  # the second was lost once, and begins a piece there
+        m = Map()
+        for n in range(30):
+            T = np.eye(4)
+            T[0, 3] = n
+            keyframe = Keyframe(m.new_keyframe_id(), n)
+            m.add_keyframe(keyframe, T, covariance=1e-6 * (n + 1) * np.eye(6))
+            if n == begin:
+                m.begin_piece(n)
+        maps.append(m)
+    merging = Told(vocabulary, verifier(), False).merge(*maps)
+    assert [loop.is_accepted for loop in merging.loops] == [True, True, False]
+    assert [piece.first_id for piece in Atlas(merging.map).pieces] == [0, 50]
+
+
 # ---- within a run ----
 
 

@@ -17,6 +17,7 @@ Reference: Elvira, Tardós, Montiel, "ORBSLAM-Atlas", IROS 2019, section IV; Cam
 "ORB-SLAM3", T-RO 2021, section VI.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,7 +29,7 @@ from odomap.maps.absorbing import Absorbed
 from odomap.maps.map import Map
 from odomap.maps.states import Placement, compose, inverse
 from odomap.system.closing import Verifier
-from odomap.system.closure import Closure, Tie, edges_of, read_essentials
+from odomap.system.closure import Closure, Tie, edges_of, pieces_of, read_essentials
 from odomap.system.essentialgraph import correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.loopsides import LoopSide
@@ -126,9 +127,12 @@ class Merger:
         essentials = read_essentials(merged, search.known).essentials()
         found = correct(essentials, edges_of(essentials, ties), self._with_scale)
         believed = [tie for tie, is_true in zip(ties, found.is_believed.tolist()) if is_true]
-        if len(believed) < self._config.agreeing:
-            needed = f"{self._config.agreeing} needed"
-            return _without(nowhere, ties, f"{len(believed)} places in common agree of {needed}")
+        pieces = pieces_of(essentials, believed)  # each pair of them needs its own
+        agree, needed = Counter(pieces), self._config.agreeing
+        most = max(agree.values(), default=0)
+        if most < needed:
+            return _without(nowhere, ties, f"{most} places in common agree of {needed} needed")
+        believed = [tie for tie, both in zip(believed, pieces) if agree[both] >= needed]
         chosen = _apart(believed, self._config.apart)
         if len(chosen) < len(ties):
             found = correct(essentials, edges_of(essentials, chosen), self._with_scale)
