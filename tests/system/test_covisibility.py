@@ -8,7 +8,7 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.states import stretched
 from odomap.system.closure import carry_covariance
-from odomap.system.covisibility import Covisibility, acquaint
+from odomap.system.covisibility import Acquaintance, Covisibility, acquaint
 
 
 def odometry(count=5, seed=0):
@@ -85,3 +85,14 @@ def test_what_hung_from_one_that_goes_is_less_sure_by_both_steps(gone, units):
             assert known.scale[k] == pytest.approx(now.scale_parent_keyframe)
             np.testing.assert_allclose(known.motion[k], now.T_parent_keyframe, atol=1e-9)
             np.testing.assert_allclose(known.growth[k], now.growth, atol=1e-8)
+
+
+def test_steps_that_loops_have_made_surer_tell_nothing():
+    grown, none = np.eye(6), np.zeros(0, np.int64)
+    shrunk, turned = (np.diag(np.repeat(signs, 3).astype(float)) for signs in ([-1, 1], [1, -1]))
+    known = Covisibility(1, 2)
+    for k, growth in enumerate((np.full((6, 6), np.nan), grown, shrunk, turned)):
+        known.add(Acquaintance(k, none, none, k - 1, np.eye(4), 1.0, growth))
+    known.untell_shrunk()
+    assert np.array_equal(known.growth[1], grown)
+    assert np.isnan(known.growth[[0, 2, 3]]).all()

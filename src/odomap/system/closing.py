@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from odomap.backend.graphs.graphproblem import import_group
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse, se3_log, so3_log
+from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import (
@@ -48,6 +49,7 @@ from odomap.system.covisibility import Acquaintance
 from odomap.system.essentialgraph import Corrected, Essentials, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
 from odomap.system.loopsides import LoopSide, read_side
+from odomap.system.path import ASTRAY
 from odomap.system.revisits import Revisit
 from odomap.system.stages import Loop
 from odomap.system.verifying import Verified, VerifyConfig, verify
@@ -64,9 +66,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-ASTRAY = 5.0
-"""Standard deviations of where a camera unseen may be beyond which it has not moved by itself."""
 
 
 class Verifier(Protocol):
@@ -158,6 +157,8 @@ class LoopCloser:
         self._waiting: Tie | None = None
         import_group("Sim3" if with_scale else "SE3")
         search.index(search.follow(map))
+        if LOOP in map.edges().kind:
+            search.known.untell_shrunk()
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":
         """Take in a keyframe that is in the map, and read both sides of the last candidates."""
@@ -209,6 +210,7 @@ class LoopCloser:
                 corrected = correct(essentials, edges_of(essentials, (tie,)), self._with_scale)
                 same, reason = self._confirming(essentials, tie, corrected)
                 if not reason:
+                    _log_doubts(corrected)
                     loops.append(_closed(loop, essentials, corrected))
                     return loops, Closure((tie,), essentials, corrected, same)
                 loop = replace(loop, reason=reason)
@@ -349,14 +351,19 @@ def strayed(
     xi, covariance = moved[k, used], before.covariances[rows[k]][used, used]
     if not np.isfinite(covariance).all():
         return ""
-    distance = float(np.sqrt(xi @ np.linalg.pinv(covariance, hermitian=True) @ xi))
-    if distance <= ASTRAY:
+    if xi @ np.linalg.pinv(covariance, hermitian=True) @ xi <= ASTRAY**2:
         return ""
     metres, degrees = np.linalg.norm(moved[k, :3]), np.degrees(np.linalg.norm(moved[k, 3:]))
     where = (
         f"{degrees:.0f}° turned" if with_scale else f"{metres:.2g} away and {degrees:.0f}° turned"
     )
     return f"joins two pieces of the map, but {where}: further than the camera can have come unseen"
+
+
+def _log_doubts(corrected: Corrected) -> None:
+    if corrected.num_rejected:
+        text = "%d loops closed before are not believed any more: they contradict a new one"
+        logging.getLogger(__name__).warning(text, corrected.num_rejected)
 
 
 def _log(loops: list[Loop]) -> None:

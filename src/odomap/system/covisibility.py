@@ -140,6 +140,15 @@ class Covisibility:
         """Return how a keyframe lies in its parent, as a similarity."""
         return self.motion[keyframe_id].copy(), np.asarray(self.scale[keyframe_id])
 
+    def untell_shrunk(self) -> None:
+        """Forget growths of what became surer than its parent: closed loops made it so.
+
+        In a map that is opened again covariances hold what loops told; that odometry grew no less
+        sure on a step is not one of the things that they tell.
+        """
+        blocks = np.trace(self.growth.reshape(-1, 2, 3, 2, 3), axis1=2, axis2=4)
+        self.growth[(blocks[:, [0, 1], [0, 1]] <= 0.0).any(axis=1)] = np.nan
+
     def neighbours(self, keyframe_id: int) -> Index:
         """Return the (n,) keyframes that share landmarks with one, most first, then oldest."""
         shared = self._shared.get(keyframe_id, {})

@@ -20,10 +20,12 @@ from odomap.geometry.trajectory import Trajectory
 from odomap.maps.map import Map
 from odomap.maps.states import stretched
 
-__all__ = ["Path", "Placed"]
+__all__ = ["ASTRAY", "Path", "Placed"]
 
 Array = NDArray[np.float64]
 
+ASTRAY = 5.0
+"""Standard deviations of where a body unseen may be beyond which it has not moved by itself."""
 LEAP = 3.0
 """Times the fastest that a body has moved so far, from which on it leaps."""
 SIGMAS = 5.0

@@ -37,7 +37,7 @@ from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located
 from odomap.system.looking import Clock, Look, Looker, Unseen, doubt
-from odomap.system.path import Path, Placed
+from odomap.system.path import ASTRAY, Path, Placed
 from odomap.system.starting import Start, Started, Waiting
 from odomap.system.veil import VEILED, Veil
 from odomap.vision.coverage import coverage
@@ -69,8 +69,6 @@ class Known(Protocol):
 
 K = TypeVar("K", bound=Known)
 
-ASTRAY = 5.0
-"""Standard deviations of where a body unseen may be beyond which it has not moved by itself."""
 WELL = 2
 """How many times the inliers needed must be settled for that to be believed."""
 SHOWS = 0.15
