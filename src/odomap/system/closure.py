@@ -113,10 +113,13 @@ def _read_loops(map: Map) -> LoopEdges:
     chosen = np.flatnonzero(np.array(edges.kind, str) == LOOP)
     ends = edges.i[chosen], edges.j[chosen]
     (p, T_p_i), (q, T_q_j) = (_held(map, end) for end in ends)
-    D = inverse(T_q_j)
-    Ts, scales = compose(compose(T_p_i, (edges.Ts_i_j[chosen], edges.scales_i_j[chosen])), D)
-    Ad = se3_adjoint(D[0])
+    D, scales_i_j = inverse(T_q_j), edges.scales_i_j[chosen]
+    Ts, scales = compose(compose(T_p_i, (edges.Ts_i_j[chosen], scales_i_j)), D)
+    lever = D[0].copy()
+    lever[:, :3, 3] *= scales_i_j[:, None]  # in the units of i, as the information is
+    Ad = se3_adjoint(lever)
     information = np.swapaxes(Ad, 1, 2) @ edges.information[chosen] @ Ad
+    information = stretched(information, 1.0 / T_p_i[1])  # now in those of p
     is_one = p == q  # both ends have come to hang from one keyframe: nothing is left to say
     return LoopEdges(*(x[~is_one] for x in (p, q, Ts, scales, information)))
 

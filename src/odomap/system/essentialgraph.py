@@ -36,8 +36,9 @@ from odomap.backend.graphs.components import find_components
 from odomap.backend.graphs.covariances import GraphCovariances
 from odomap.backend.graphs.gnc import find_inliers
 from odomap.backend.graphs.posegraph import Group, PoseGraph
-from odomap.backend.graphs.solve import Stop, solve
+from odomap.backend.graphs.solve import solve
 from odomap.geometry.lie import se3_adjoint, se3_inverse, sim3_inverse, so3_log
+from odomap.maps.states import stretched
 
 __all__ = ["Corrected", "EssentialGraph", "Essentials", "LoopEdges", "correct"]
 
@@ -164,16 +165,13 @@ class Corrected:
     is_merging: Bool = field(default_factory=lambda: np.zeros(0, bool))
 
 
-def correct(
-    parts: Essentials, new: LoopEdges, with_scale: bool, stop: Stop | None = None
-) -> Corrected:
+def correct(parts: Essentials, new: LoopEdges, with_scale: bool) -> Corrected:
     """Correct a path by new loops.
 
     Args:
         parts: the map's keyframes and what ties them.
         new: a loop, or several that are found together.
         with_scale: whether scale drifts: a single camera.
-        stop: ends early, with what there is.
 
     Returns:
         Where the keyframes are then, or why none of the loops is believed.
@@ -183,7 +181,7 @@ def correct(
     sparse = _as_unsure_as_told(parts, _graph(parts, loops, with_scale), count)
     is_merging = _is_apart(sparse, count)
     doubts = np.full(sparse.num_edges, DOUBT**-2)
-    inliers = find_inliers(sparse, doubts, stop=None if stop is None else stop.is_set)
+    inliers = find_inliers(sparse, doubts)
     is_true = inliers.is_inlier | ~sparse.is_doubted
     num_rejected, is_believed = int((~is_true[:-count]).sum()), is_true[-count:]
     told = num_rejected, "", is_believed, is_merging
@@ -193,7 +191,7 @@ def correct(
     whole = _with_covisibility(sparse.placed(inliers.Ts_world_node), parts)
     weights = np.concatenate([is_true, np.ones(whole.num_edges - len(is_true))])
     config = SolverConfig(iterations=ITERATIONS)
-    solution = solve(whole, initial="given", weights=weights, config=config, stop=stop)
+    solution = solve(whole, initial="given", weights=weights, config=config)
     Ts, scales = _rigid(solution.Ts_world_node, with_scale)
     believed = sparse.without(~is_true).placed(solution.Ts_world_node)
     return Corrected(Ts, scales, _covariances(parts, believed, Ts, scales), True, *told)
@@ -212,9 +210,9 @@ def _graph(parts: Essentials, loops: LoopEdges, with_scale: bool) -> EssentialGr
     is_fixed = np.zeros(len(Ts), bool)
     is_fixed[parts.root] = True
     measured = _similar(loops.Ts_i_j, loops.scales_i_j, with_scale)
-    units = np.ones((len(loops.i), 6))
-    units[:, :3] = loops.scales_i_j[:, None] if with_scale else 1.0  # tangents are those of j
-    ties = loops.information * units[:, :, None] * units[:, None, :]
+    ties = loops.information
+    if with_scale:  # tangents are those of j, in its units; information goes the other way
+        ties = stretched(ties, loops.scales_i_j)
     ties = _with_log_scale(ties, LOOP_SCALE**-2, with_scale)
     return EssentialGraph(
         group,
@@ -240,25 +238,19 @@ def _as_unsure_as_told(parts: Essentials, graph: EssentialGraph, count: int) -> 
         count: of the loops, the last, of which the map does not know yet.
     """
     is_new = np.arange(graph.num_edges) >= graph.num_edges - count
-    told = parts.covariances / (units := _units(parts.scales))
+    told = stretched(parts.covariances, 1.0 / parts.scales)
     rows = np.flatnonzero(np.isfinite(told).all(axis=(1, 2)) & (parts.parent >= 0))
     if not (len(rows) and np.isfinite(told[parts.root]).all()):
         return graph
     walk = GraphCovariances(graph.without(is_new)).marginals()[rows, :6, :6]
     T = parts.Ts_world_body
     Ad = se3_adjoint(se3_inverse(T[rows]) @ T[parts.root])
-    walk = walk + Ad @ parts.covariances[parts.root] @ np.swapaxes(Ad, 1, 2) / units[rows]
+    held = Ad @ parts.covariances[parts.root] @ np.swapaxes(Ad, 1, 2)
+    walk = walk + stretched(held, 1.0 / parts.scales[rows])
     ratio = np.trace(np.linalg.solve(walk, told[rows]), axis1=1, axis2=2) / 6.0
     factor = float(np.clip(np.median(ratio), LEAST_FACTOR, 1.0))
     surer = np.where(graph.is_doubted, 1.0, 1.0 / factor)
     return replace(graph, information=graph.information * surer[:, None, None])
-
-
-def _units(scales: Array) -> Array:
-    """Return what a covariance (K, 6, 6) is to be divided by for the units of its keyframe."""
-    units = np.ones((len(scales), 6))
-    units[:, :3] = scales[:, None]
-    return units[:, :, None] * units[:, None, :]
 
 
 def _with_covisibility(graph: EssentialGraph, parts: Essentials) -> EssentialGraph:
@@ -383,9 +375,7 @@ def _covariances(
     """Return how sure the poses are, (K, 6, 6); None where the map knew nothing of it."""
     if not np.isfinite(parts.growth).all(axis=(1, 2)).any():
         return None
-    units = np.ones((len(Ts), 6))
-    units[:, :3] = scales[:, None]
-    found = GraphCovariances(graph).marginals()[:, :6, :6] * units[:, :, None] * units[:, None, :]
+    found = stretched(GraphCovariances(graph).marginals()[:, :6, :6], scales)
     parted = find_components(graph)
     roots = parted.anchor[parted.label]  # each held by the oldest of its piece, as sure as that is
     known = np.where(np.isfinite(parts.covariances[roots]), parts.covariances[roots], 0.0)

@@ -59,8 +59,10 @@ class RecognisedStart:
             return Waiting(f"not recognised: {found}")
         T_camera_body = se3_inverse(self._eye.T_body_camera)
         T_world_body = found.T_world_camera @ T_camera_body
-        Ad = se3_adjoint(self._eye.T_body_camera)
-        sure = self._map.covariance(found.keyframe_id) + Ad @ found.covariance @ Ad.T
+        T_body_known = se3_inverse(T_world_body) @ self._map.T_world_body(found.keyframe_id)
+        Ad, Ad_known = (se3_adjoint(T) for T in (self._eye.T_body_camera, T_body_known))
+        known = self._map.covariance(found.keyframe_id)
+        sure = Ad_known @ known @ Ad_known.T + Ad @ found.covariance @ Ad.T
         pixels = seen.keypoints[found.rows].astype(np.float64)
         shown = self._keyframes.measure_found(frame, view, T_world_body, found.landmark_ids, pixels)
         made = self._keyframes.add(view, T_world_body, shown, found.keyframe_id, sure)
