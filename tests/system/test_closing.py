@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from odomap.files.vocabulary import Vocabulary
-from odomap.geometry.lie import se3_inverse
+from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.states import stretched
@@ -167,6 +167,48 @@ def test_a_keyframe_that_was_mapped_before_a_loop_is_written_keeps_what_odometry
     np.testing.assert_array_equal(circuit.map.covariance(keyframe.id), carried)
     growth = closer.search.known.growth[keyframe.id]
     np.testing.assert_allclose(growth, np.diag(np.maximum(STEP, 1e-4) ** 2), atol=1e-9)
+
+
+def test_a_keyframe_that_came_while_the_one_before_was_mapped_waits_for_its_turn(vocabulary):
+    circuit = Circuit(around(80), Walls.make(), seed=1)
+    closer = closer_of(circuit, vocabulary)
+    go(circuit, closer, 3)
+    known = closer.search.known
+    early, late = circuit.add(), circuit.add()  # the tracker runs ahead
+    closer.add(early).solve().write(circuit.map)
+    assert known.keyframe_ids.tolist() == [0, 1, 2, early.id]
+    wide = 4.0 * circuit.map.covariance(late.id)
+    circuit.map.set_covariance([late.id], wide)  # the mapper is done with it
+    closer.add(late).solve().write(circuit.map)
+    assert known.keyframe_ids.tolist() == [0, 1, 2, early.id, late.id]
+    step = se3_inverse(circuit.map.T_world_body(early.id)) @ circuit.map.T_world_body(late.id)
+    Ad = se3_adjoint(se3_inverse(step))
+    grown = wide - Ad @ circuit.map.covariance(early.id) @ Ad.T
+    np.testing.assert_allclose(known.growth[late.id], grown, atol=1e-12)
+
+
+def test_a_tracker_that_runs_ahead_closes_the_same_loop_over_the_same_path(vocabulary):
+    found = []
+    for ahead in (0, 3):
+        circuit = Circuit(around(80), Walls.make(), seed=1)
+        closer = closer_of(circuit, vocabulary)
+        for n in range(len(circuit.true) - ahead):
+            while circuit.count <= n + ahead:
+                circuit.add()
+            if ahead and n == 65:
+                circuit.map.begin_piece(n + ahead)  # of which the closer does not know yet
+            change = closer.add(circuit.map.keyframe(n)).solve()
+            if change.closure is not None:
+                break
+            change.write(circuit.map)
+        before = change.closure.before
+        found.append((n, change.loops[0].matched_id, before))
+        drifted = circuit.errors()[n]
+        change.write(circuit.map)
+        assert circuit.errors()[n] < 0.5 * drifted
+    assert found[0][:2] == found[1][:2]
+    assert found[0][2].keyframe_ids.tolist() == found[1][2].keyframe_ids.tolist()
+    np.testing.assert_array_equal(found[0][2].growth, found[1][2].growth)
 
 
 class Mistaken(SideVerifier):

@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.background import Lane, QuickSwitching, ThreadConfig
+from odomap.system.closing import LoopCloser
 from odomap.system.config import Config
 from odomap.system.lockstep import LockstepWorker
+from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.odometry import StereoVO
 from odomap.system.stages import Loop, Solved, Stages
 from odomap.system.worker import InlineWorker
@@ -164,6 +167,47 @@ def test_a_delay_of_one_frame_gives_every_frame_the_map_it_would_see_inline():
     _, live, final = result(make(1, 0))
     _, inline_live, inline_final = result(make(worker=InlineWorker))
     assert (live, final) == (inline_live, inline_final)
+
+
+class Sure:
+    """A mapper that says how sure a keyframe is: k + 1 in all directions; slow where told."""
+
+    def __init__(self, map, nap):
+        self.map, self.nap = map, nap
+
+    def add(self, keyframe):
+        return Saying(self, keyframe.id)
+
+
+class Saying:
+    loops = ()
+
+    def __init__(self, stage, keyframe_id):
+        self.stage, self.keyframe_id = stage, keyframe_id
+
+    def solve(self):
+        time.sleep(self.stage.nap)
+        return self
+
+    def write(self, map):
+        map.set_covariance([self.keyframe_id], (self.keyframe_id + 1.0) * np.eye(6))
+
+
+@pytest.mark.parametrize("delays", [None, (0, 0), (1, 20), (2, 5), (7, 20)])
+def test_the_closer_writes_down_what_the_mapper_is_done_with(delays):
+    m = Map()
+    search = LoopSearch(SimpleNamespace(num_words=1), ClosingConfig())
+    closer = LoopCloser(m, search, SimpleNamespace(read=None), False, ClosingConfig())
+    stages = Stages(m, Track(m, []), Sure(m, 0.002), closer)
+    worker = InlineWorker(stages)
+    if delays is not None:
+        worker = LockstepWorker(stages, ThreadConfig(*delays))
+    list(worker.run(frames(30)))
+    worker.finish()
+    assert search.known.keyframe_ids.tolist() == list(range(10))
+    growths = search.known.growth[1:10]
+    assert np.isfinite(growths).all()  # NaN until it is mapped
+    np.testing.assert_allclose(growths[:, 3:, 3:], np.tile(np.eye(3), (9, 1, 1)))
 
 
 @pytest.mark.parametrize(("mapping", "closing"), [(1, 1), (2, 0), (2, 5), (7, 20)])

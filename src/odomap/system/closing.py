@@ -161,7 +161,10 @@ class LoopCloser:
             search.known.untell_shrunk()
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":
-        """Take in a keyframe that is in the map, and read both sides of the last candidates."""
+        """Take in a keyframe that is mapped, and read both sides of the last candidates.
+
+        Later ones may be in the map already, where the tracker runs ahead: they wait.
+        """
         self._since_closed += 1
         return self._job(keyframe)
 
@@ -170,7 +173,7 @@ class LoopCloser:
         return self._job(None) if self._asked else None
 
     def _job(self, keyframe: Keyframe | None) -> "ClosingJob":
-        news = self.search.follow(self._map)
+        news = self.search.follow(self._map, None if keyframe is None else keyframe.id)
         asked, self._asked = self._asked, []
         candidates = self._read(asked)
         path = read_essentials(self._map, self.search.known) if candidates else None

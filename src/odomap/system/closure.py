@@ -77,7 +77,7 @@ class Reading:
         row = np.full(len(self.parent) + 1, -1)
         row[ids] = np.arange(len(ids))
         pairs, parent = row[self.pairs], self.parent.copy()
-        parent[self.begins] = -1
+        parent[self.begins[self.begins < len(parent)]] = -1  # a piece may begin later
         return Essentials(
             ids,
             self.snapshot.Ts_world_body,
@@ -96,10 +96,11 @@ def read_essentials(map: Map, known: Covisibility) -> Reading:
 
     Args:
         map: the map.
-        known: what was written down of all its living keyframes.
+        known: what was written down of its living keyframes; those it lacks are left out.
     """
     with map.lock:
-        snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
+        ids = map.keyframe_ids
+        snapshot = map.snapshot(ids[np.isin(ids, known.keyframe_ids)], landmarks=False)
         covariances = map.states.covariances[snapshot.keyframe_ids]
         loops, begins = _read_loops(map), beginnings(map)
     growth = known.growth.copy()

@@ -98,9 +98,16 @@ class LoopSearch:
         self._revisits = Revisits(self._places, revisits)
         self._carried: dict[int, Carried] = {}
 
-    def follow(self, map: Map) -> News:
-        """Write down which keyframes of a map went and came."""
+    def follow(self, map: Map, newest: int | None = None) -> News:
+        """Write down which keyframes of a map went and came.
+
+        Args:
+            map: what is followed.
+            newest: the last keyframe that mappers are done with; what is written down of later ones
+                would be what nobody has mapped yet, and so they wait. Default: the last there is.
+        """
         alive, known = map.keyframe_ids, self.known.keyframe_ids
+        alive = alive if newest is None else alive[alive <= newest]
         gone = known[~np.isin(known, alive)].tolist()
         come = alive[~np.isin(alive, known)].tolist()
         for k in gone:
