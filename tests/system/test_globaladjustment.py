@@ -177,6 +177,35 @@ def test_a_map_without_anything_seen_twice_is_left_alone():
     assert change.parts() == ()
 
 
+@pytest.mark.parametrize("deep", [True, False])
+def test_of_the_smallest_maps_it_adjusts_what_can_be(deep):
+    adjusted = []
+    for left in range(9):
+        for keyframes in (1, 2, 3):
+            w = adjust_world(keyframes, landmarks=200, deep=deep, spacing=0.3, laps=0.05, seed=1)
+            kept = w.seen[:left]
+            w.map.remove_landmarks(np.setdiff1d(np.arange(200), kept))
+            places = w.map.Ts_world_body(w.map.keyframe_ids)
+            parts = job_of(w).solve().parts()
+            for part in parts:
+                part.write(w.map)
+            assert np.isfinite(w.map.Ts_world_body(w.map.keyframe_ids)).all()
+            if parts:
+                adjusted.append((keyframes, left))
+            else:
+                after = w.map.Ts_world_body(w.map.keyframe_ids)
+                np.testing.assert_array_equal(places, after)
+    assert (2, 8) in adjusted
+    assert not [k for k, n in adjusted if k == 1 or n < 3]
+
+
+def test_landmarks_that_only_keyframes_without_features_share_are_left_alone():
+    w = adjust_world(keyframes=3, landmarks=200, deep=False, spacing=0.3, laps=0.05, seed=1)
+    for k in (1, 2):
+        w.map._keyframes[k] = w.map.keyframe(k).without_payload()
+    assert job_of(w).solve().parts() == ()
+
+
 @pytest.mark.parametrize(("closing", "adjusting"), [(True, True), (True, False), (False, True)])
 def test_slam_adjusts_where_it_closes_loops(closing, adjusting):
     config = preset("stereo")

@@ -117,16 +117,16 @@ class GlobalAdjuster:
         """Return a map as a bundle, and the rows (N,) of the snapshot that its observations are.
 
         A landmark that one keyframe sees tells nothing about where keyframes are, and hangs on.
-        None where there is nothing to adjust.
+        None where too little was seen to adjust anything.
         """
-        several = np.bincount(snapshot.obs_landmark, minlength=len(snapshot.landmark_ids)) > 1
         has_features = np.array([k.features is not None for k in snapshot.keyframes], bool)
-        used = several[snapshot.obs_landmark] & has_features[snapshot.obs_keyframe]
-        rows = np.flatnonzero(used)
-        if not len(rows) or len(snapshot.keyframes) < 2:
-            return None
+        is_sight = has_features[snapshot.obs_keyframe]
+        seen = np.bincount(snapshot.obs_landmark, is_sight, minlength=len(snapshot.landmark_ids))
+        rows = np.flatnonzero(is_sight & (seen[snapshot.obs_landmark] > 1))
         bearings, depths, levels = _measured(snapshot, rows)
         inverse = 1.0 / depths - bias_at(bias, bearings)
+        if not _is_told(snapshot, rows, int(np.isfinite(inverse).sum())):
+            return None
         first = np.arange(len(snapshot.keyframes)) == 0
         Ts_camera_world = self._T_camera_body @ se3_inverse(snapshot.Ts_world_body)
         problem = Adjustment(
@@ -153,6 +153,13 @@ class GlobalAdjuster:
     def poses(self, solution: AdjustmentSolution) -> Array:
         """Return where a solution has the keyframes, Ts_world_body (K, 4, 4)."""
         return np.asarray(se3_inverse(solution.Ts_camera_world) @ self._T_camera_body)
+
+
+def _is_told(snapshot: Snapshot, rows: Index, num_depths: int) -> bool:
+    """Say whether as many numbers were seen as are unknown of what is seen, one keyframe held."""
+    views, points = (np.unique(x[rows]) for x in (snapshot.obs_keyframe, snapshot.obs_landmark))
+    unknown = 6 * int(np.count_nonzero(views)) + 3 * len(points)  # the first keyframe is held
+    return len(views) > 1 and 2 * len(rows) + num_depths >= unknown
 
 
 def _measured(snapshot: Snapshot, rows: Index) -> tuple[Array, Array, Array]:
