@@ -1,5 +1,6 @@
 """Verification: what is one place is measured exactly, what only looks like one is refused."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -311,6 +312,23 @@ def test_what_is_far_ahead_and_small_is_enough_where_nothing_else_must_show():
     # If it had to be spread more than what there is to be seen, it would be refused.
     refused = check(*sides, spread=0.2, spread_share=1.0)
     assert "cover" in refused.reason
+
+
+def test_what_only_keyframes_around_it_saw_is_told_apart():
+    world = World.of(5, 900)
+    aside = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 1.6, 0.0])) @ HERE
+    found = check(side(world, HERE, 88, seed=2), side(world, aside, 3, own=0.0, group=0.9))
+    n = found.num_inliers
+    assert n >= 30
+    told = re.fullmatch(
+        r"of (\d+) inliers keyframes around 3 saw (\d+), and in its own image (\d+) show, "
+        r"which cover (\S+) %, (\S+) % needed, between keyframes 88 and 3",
+        found.reason,
+    )
+    assert told, found.reason
+    assert [int(told[1]), int(told[2]) + int(told[3])] == [n, n]
+    assert int(told[3]) < 0.1 * n
+    assert float(told[4]) < float(told[5])
 
 
 def test_identical_doors_all_over_the_image():

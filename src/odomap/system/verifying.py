@@ -257,14 +257,19 @@ def _reason(
         (newer, inliers.newer_feature, expected.in_newer),
         (matched, inliers.matched_feature, expected.in_matched),
     ):
-        covered = coverage(side.keypoints[features[features >= 0]], side.camera)
+        shown = features[features >= 0]
+        covered = coverage(side.keypoints[shown], side.camera)
         enough = max(config.spread_share * coverage(pixels, side.camera), LEAST_SPREAD)
         needed = min(config.spread, enough)
         if covered < needed:
-            return (
-                f"{found} inliers cover {100 * covered:.1f} % of keyframe {side.keyframe_id}, "
-                f"{100 * needed:.1f} % needed,"
-            )
+            what = f"{found} inliers cover {100 * covered:.1f} % of keyframe {side.keyframe_id}"
+            if len(shown) < found:
+                what = (
+                    f"of {found} inliers keyframes around {side.keyframe_id} saw "
+                    f"{found - len(shown)}, and in its own image {len(shown)} show, which cover "
+                    f"{100 * covered:.1f} %"
+                )
+            return f"{what}, {100 * needed:.1f} % needed,"
     if found < config.share * len(expected):
         return (
             f"{found} inliers of {len(expected)} landmarks expected to show, "
