@@ -17,8 +17,9 @@ from odomap.settings import override
 from odomap.sources.open import open as open_source
 from odomap.system.config import preset
 from odomap.system.slam import Slam
-from odomap.system.stages import Loop, Solved, Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.worker import InlineWorker
+from stagedoubles import Solved
 
 WORLD = "sim:room?seed=3&frames=8&rate_hz=4&resolution=400x250"
 ENABLED = override(preset("stereo"), [("closing.enabled", "true")])

@@ -11,6 +11,7 @@ from odomap.errors import InputError, TrackingFailed
 from odomap.files.mapexport import keyframe_trajectory
 from odomap.files.mapfile import load_map, read_map_rig, save_map
 from odomap.files.rig import write_rig
+from odomap.files.vocabulary import default_vocabulary_path
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.atlas import Atlas
@@ -89,6 +90,17 @@ def test_two_halves_of_a_circuit_become_one_file(cli, maps, tmp_path):
     assert np.linalg.norm(merged.T_first_second[:3, 3]) < 0.1
     (piece,) = Atlas(merged.map).pieces
     assert len(piece.merged) == 2
+
+
+def test_another_vocabulary_is_told_by_the_merged_map(cli, refused, maps, tmp_path):
+    first, second, _ = maps
+    words = tmp_path / "words.odomap-vocabulary"
+    words.write_bytes(default_vocabulary_path().read_bytes())
+    assert cli(first, second, "--vocabulary", words)[0] == 0
+    assert SavedMap.load(tmp_path / "merged.odomap").vocabulary == str(words)
+    words.write_bytes(words.read_bytes()[:1000])
+    said = refused(first, second, "--vocabulary", words)
+    assert str(words) in said
 
 
 def test_maps_of_a_program_are_merged_and_stay_as_they_are(maps):

@@ -11,7 +11,7 @@ places are no part of a map: they are made anew, whatever vocabulary it was made
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from odomap.errors import InputError, TrackingFailed
 from odomap.files.atomic import find_obstacle, make_folder
 from odomap.files.mapfile import save_map
-from odomap.savedmap import KINDS, SavedMap, map_file, rig_differences
+from odomap.savedmap import KINDS, SavedMap, map_file, map_settings, rig_differences
 
 if TYPE_CHECKING:
     from odomap.maps.map import Map
@@ -81,7 +81,7 @@ def merge_maps(
     out: str | Path | None = None,
     *,
     rig: "Rig | None" = None,
-    vocabulary: "VocabularyTree | None" = None,
+    vocabulary: "VocabularyTree | str | Path | None" = None,
     progress: Tell | None = None,
 ) -> Merged:
     """Merge two maps of one place.
@@ -91,7 +91,8 @@ def merge_maps(
         second: another, which is brought to it.
         out: file for the merged map; None writes nothing.
         rig: the sensors both were made with, for maps that do not say.
-        vocabulary: makes the words by which places are recognised; default that of odomap.
+        vocabulary: makes the words by which places are recognised, or a file of one; default that
+            of odomap.
         progress: called with steps done, steps in all, and what is being done.
 
     Returns:
@@ -112,11 +113,11 @@ def merge_maps(
     _check_out(out, first, second)
     a, b = SavedMap.of(first), SavedMap.of(second)
     rig, sensors = _common_rig(a, b, rig)
-    config = _config(sensors, rig)
+    config = _config(sensors, vocabulary)
     for saved in (a, b):
         saved.check(rig, config)
     _warm_up(tell)
-    merger = _merger(rig, config, sensors == "mono", vocabulary)
+    merger = _merger(rig, config, None if isinstance(vocabulary, str | Path) else vocabulary)
     found = merger.merge(a.map, b.map, tell)
     if found.reason:
         raise TrackingFailed(f"{b.name}: has no place in common with {a.name}: {_why(found)}")
@@ -133,7 +134,7 @@ def merge_maps(
     if out is not None:
         tell(0, 0, "writing")
         make_folder(Path(out).parent)
-        save_map(out, merged.map, rig, settings={"sensors": sensors})
+        save_map(out, merged.map, rig, settings=map_settings(config))
     return merged
 
 
@@ -192,21 +193,21 @@ def _common_rig(a: SavedMap, b: SavedMap, given: "Rig | None") -> "tuple[Rig, st
     return there, sensors
 
 
-def _config(sensors: str, rig: "Rig") -> "Config":
-    from odomap.system.config import preset, preset_for
+def _config(sensors: str, vocabulary: "VocabularyTree | str | Path | None") -> "Config":
+    from odomap.system.config import preset
+    from odomap.system.placeindex import PlacesConfig
 
-    return preset(sensors or preset_for(rig))
+    named = str(vocabulary) if isinstance(vocabulary, str | Path) else ""
+    return replace(preset(sensors), places=PlacesConfig(vocabulary=named))
 
 
-def _merger(
-    rig: "Rig", config: "Config", with_scale: bool, vocabulary: "VocabularyTree | None"
-) -> "Merger":
+def _merger(rig: "Rig", config: "Config", words: "VocabularyTree | None") -> "Merger":
     from odomap.files.vocabulary import Vocabulary
     from odomap.system.closing import SideVerifier
     from odomap.system.merging import Merger
     from odomap.system.visual import Sight
 
-    eye = Sight.of(rig, config).eye
+    eye, with_scale = Sight.of(rig, config).eye, config.tracking.sensors == "mono"
     verifier = SideVerifier(
         eye.camera,
         eye.T_body_camera,
@@ -215,7 +216,8 @@ def _merger(
         with_scale,
         config.matching,
     )
-    words = Vocabulary.load() if vocabulary is None else vocabulary
+    if words is None:
+        words = Vocabulary.load(config.places.vocabulary or None)
     return Merger(words, verifier, with_scale, config.closing)
 
 

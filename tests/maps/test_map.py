@@ -241,25 +241,6 @@ def test_snapshots_are_read_only_copies():
             getattr(snapshot, name)[:1] = 0
 
 
-def test_an_update_may_be_applied_in_parts():
-    rng = np.random.default_rng(5)
-    (whole, _), (parts, _) = chain(8), chain(8)
-    snapshot = whole.snapshot(np.arange(2, 8), [0, 1])
-    Ts = snapshot.Ts_world_body @ pose((0.2, 0.1, 0), 0.1)
-    Ts[snapshot.is_fixed] = snapshot.Ts_world_body[snapshot.is_fixed]
-    points = snapshot.points_world + rng.normal(size=snapshot.points_world.shape)
-    solution = snapshot.solved(Ts, points, scales=np.full(8, 1.3), dropped=np.arange(4))
-    whole.apply(solution)
-    pieces = solution.split(7)
-    assert len(pieces) == 1 + -(-len(points) // 7)
-    for piece in pieces:
-        parts.apply(piece)
-    everyone, ids = np.arange(8), whole.landmark_ids
-    np.testing.assert_allclose(parts.Ts_world_body(everyone), whole.Ts_world_body(everyone))
-    np.testing.assert_allclose(parts.points_world(ids), whole.points_world(ids), atol=1e-12)
-    assert parts.num_observations == whole.num_observations
-
-
 def test_a_snapshot_for_a_pose_graph_has_no_landmarks():
     m, _ = chain(5)
     snapshot = m.snapshot([1, 2, 3, 4], [0], landmarks=False)

@@ -15,8 +15,9 @@ from odomap.system.adjusting import AdjustingConfig
 from odomap.system.background import ThreadConfig
 from odomap.system.live import LiveWorker
 from odomap.system.lockstep import LockstepWorker
-from odomap.system.stages import Loop, Solved, Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.worker import InlineWorker
+from stagedoubles import Solved
 from system.test_lockstep import Lift, Track, frames
 
 

@@ -22,8 +22,9 @@ from odomap.system.config import Config
 from odomap.system.lockstep import LockstepWorker
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.odometry import StereoVO
-from odomap.system.stages import Loop, Solved, Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.worker import InlineWorker
+from stagedoubles import Solved
 
 EVERY = 3
 

@@ -102,6 +102,6 @@ def test_keyframes_without_words_are_left_out(tree):
     assert known(index) == [2]
     assert len(index) == 1
     assert index.keep_up(5) == 0
-    assert [described(m, k) is None for k in range(3)] == [True, True, False]
+    assert [described(m.keyframe(k)) is None for k in range(3)] == [True, True, False]
     assert index.find(index.words(looks(0)), 3) == [2]
     assert index.find(index.words(looks(0)[:0]), 3) == []

@@ -16,8 +16,9 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.rhythms import RHYTHMS, make_worker
-from odomap.system.stages import Loop, Solved, Stages
+from odomap.system.stages import Loop, Stages
 from odomap.system.worker import InlineWorker, Worker, deferred_interrupt
+from stagedoubles import Solved
 
 
 class Track:

@@ -28,6 +28,9 @@ class Merge:
     """Where to write the merged map."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: the sensors both were made with, for maps that do not say."""
+    vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A vocabulary to recognise places by, as `odomap vocabulary train` writes it; default that
+    which comes with odomap."""
     quiet: bool = False
     """No progress."""
 
@@ -38,7 +41,14 @@ class Merge:
 
         rig = None if self.rig is None else read_rig(self.rig)
         with Steps("merge", self.quiet) as steps:
-            merged = merge_maps(self.first, self.second, self.out, rig=rig, progress=steps.show)
+            merged = merge_maps(
+                self.first,
+                self.second,
+                self.out,
+                rig=rig,
+                vocabulary=self.vocabulary,
+                progress=steps.show,
+            )
         m, size = merged.map, self.out.stat().st_size / 2**20
         print(f"{'merged':<16} {merged.summary}")
         counts = f"{m.num_keyframes} keyframes, {m.num_landmarks} landmarks, {size:.2f} MB"

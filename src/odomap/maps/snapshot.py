@@ -13,7 +13,7 @@ since move with the ancestor they were placed against.
 Reference: M. Kaess et al., Concurrent filtering and smoothing, 2012 (solving beside a live map).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,38 +79,6 @@ class Update:
         R = Ts[:, :3, :3]
         if np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() > 1e-6:
             raise ValueError("update: a rotation is not orthonormal, the map stays as it is")
-
-    def split(self, landmarks: int) -> "tuple[Update, ...]":
-        """Cut a large update into parts that each hold the map's lock for a short time only.
-
-        The first part moves the keyframes, and with them all landmarks as they hang; the others
-        bring the landmarks to their own places. Applied in order they do what the whole does.
-
-        Args:
-            landmarks: how many a part may move.
-
-        Returns:
-            The parts.
-        """
-        nothing, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
-        scales = None if self.scales is None else np.zeros(0)
-        parts = [replace(self, landmark_ids=nothing, points_world=nowhere)]
-        for start in range(0, len(self.landmark_ids), landmarks):
-            part = slice(start, start + landmarks)
-            parts.append(
-                Update(
-                    anchor_id=self.anchor_id,
-                    T_world_anchor=self.T_world_anchor,
-                    keyframe_ids=nothing,
-                    Ts_world_body=np.zeros((0, 4, 4)),
-                    landmark_ids=self.landmark_ids[part],
-                    points_world=self.points_world[part],
-                    version=self.version,
-                    scales=scales,
-                    scale_anchor=self.scale_anchor,
-                )
-            )
-        return tuple(parts)
 
 
 @dataclass(frozen=True, eq=False)

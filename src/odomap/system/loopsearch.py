@@ -27,6 +27,7 @@ from odomap.limits import Count, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
+from odomap.system.placeindex import described
 from odomap.system.revisits import Revisit, RevisitConfig, Revisits
 from odomap.vision.places import Places
 from odomap.vision.vocabulary import VocabularyTree
@@ -128,7 +129,7 @@ class LoopSearch:
         for k in news.gone:
             self._places.remove(k)
         for keyframe in news.come:
-            descriptors = _descriptors(keyframe)
+            descriptors = described(keyframe)
             if descriptors is not None:
                 self._places.add(keyframe.id, self._vocabulary.transform(descriptors))
 
@@ -139,7 +140,7 @@ class LoopSearch:
             keyframe: the new one.
             recent: (n,) keyframes that are none.
         """
-        descriptors = _descriptors(keyframe)
+        descriptors = described(keyframe)
         if descriptors is None:
             return []
         bow = self._vocabulary.transform(descriptors)
@@ -159,11 +160,3 @@ class LoopSearch:
         """
         self._carried.update(carried)
         self._revisits.forget()
-
-
-def _descriptors(keyframe: Keyframe) -> NDArray[np.uint8] | None:
-    """Return the (N, 32) descriptors of a keyframe; None where it has none of 256 bits."""
-    features = keyframe.features
-    if features is None or features.descriptors.shape[1:] != (32,) or not len(features):
-        return None
-    return features.descriptors

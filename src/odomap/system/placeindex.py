@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.revisits import group_scores
 from odomap.vision.places import Places
@@ -90,7 +91,7 @@ class PlaceIndex:
         return max(len(missing) - most, 0)
 
     def _add(self, keyframe_id: int) -> None:
-        descriptors = described(self._map, keyframe_id)
+        descriptors = described(self._map.keyframe(keyframe_id))
         if descriptors is None:
             self._nodes[keyframe_id] = None
             return
@@ -119,9 +120,9 @@ class PlaceIndex:
         return [matched for matched, *_ in groups[:most]]
 
 
-def described(map: Map, keyframe_id: int) -> Descriptors | None:
+def described(keyframe: Keyframe) -> Descriptors | None:
     """Return the (N, 32) descriptors of a keyframe; None where it has none of 256 bits."""
-    features = map.keyframe(keyframe_id).features
-    if features is None or features.descriptors.shape[1] != 32:
+    features = keyframe.features
+    if features is None or features.descriptors.shape[1:] != (32,) or not len(features):
         return None
     return features.descriptors

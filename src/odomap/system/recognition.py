@@ -175,7 +175,7 @@ class Recognizer:
         return [place for place in places if place is not None]
 
     def _place(self, keyframe_id: int) -> Place | None:
-        descriptors = described(self._map, keyframe_id)
+        descriptors = described(self._map.keyframe(keyframe_id))
         if descriptors is None:
             return None
         ids, rows = self._map.observations_of(keyframe_id)
@@ -191,6 +191,6 @@ def describes_places(map: Map) -> bool:
     """Return whether a map has what recognition needs: landmarks seen by described features."""
     with map.lock:
         return any(
-            described(map, k) is not None and len(map.observations_of(k)[0])
+            described(map.keyframe(k)) is not None and len(map.observations_of(k)[0])
             for k in map.keyframe_ids.tolist()
         )

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from odomap.maps.estimate import Estimate
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.maps.snapshot import Update
 from odomap.sensors.frame import Frame
 
 __all__ = [
@@ -40,7 +39,6 @@ __all__ = [
     "Loop",
     "MapState",
     "Mapper",
-    "Solved",
     "Stages",
     "Stop",
     "Tracker",
@@ -206,24 +204,6 @@ class Adjuster(Protocol):
     def end(self) -> LongJob | None:
         """Return what is to be done since the last loop, at the end of a run; None if nothing."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """A change made of solutions: `Update`s to apply in order.
-
-    Attributes:
-        updates: what solvers found.
-        loops: loop candidates that were decided on.
-    """
-
-    updates: tuple[Update, ...]
-    loops: tuple[Loop, ...] = ()
-
-    def write(self, map: Map) -> None:
-        """Apply the updates."""
-        for update in self.updates:
-            map.apply(update)
 
 
 @dataclass(frozen=True, eq=False)
