@@ -18,9 +18,10 @@ Reference: G. Klein, D. Murray, Parallel tracking and mapping for small AR works
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Generic, TypeVar
 
 from odomap.limits import Count, Limits, check_limits
 from odomap.maps.keyframes import Keyframe
@@ -29,6 +30,7 @@ from odomap.system.stages import Adjuster, Change, Closer, Job, LongChange, Long
 __all__ = ["Lane", "QuickSwitching", "Sideline", "ThreadConfig"]
 
 Frames = Annotated[int, Limits(least=0)]
+C = TypeVar("C")
 
 
 @dataclass(frozen=True)
@@ -91,24 +93,20 @@ class QuickSwitching:
                 sys.setswitchinterval(cls._before)
 
 
-class Lane:
-    """A stage beside the tracker, with at most one job out.
+class _Line(Generic[C]):
+    """A thread of its own in which one job at a time is solved.
 
     Args:
         name: for timing and for the thread.
-        stage: mapper or closer.
 
     Attributes:
-        name: of the lane.
-        keyframe: the one whose job is out, or None.
+        name: of the line.
         solved_ms: milliseconds that the last job was solved in.
     """
 
-    def __init__(self, name: str, stage: Mapper | Closer) -> None:
-        self.name, self._stage = name, stage
-        self.keyframe: Keyframe | None = None
-        self.solved_ms = 0.0
-        self._future: Future[Change] | None = None
+    def __init__(self, name: str) -> None:
+        self.name, self.solved_ms = name, 0.0
+        self._future: Future[C] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     @property
@@ -120,6 +118,56 @@ class Lane:
     def is_solved(self) -> bool:
         """Whether a job is out whose change, or whose error, is there."""
         return self._future is not None and self._future.done()
+
+    def _begin(self, solve: Callable[[], C]) -> None:
+        """Solve a job in the thread."""
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
+        self._future = self._thread.submit(self._timed, solve)
+
+    def _timed(self, solve: Callable[[], C]) -> C:
+        start = time.perf_counter()
+        change = solve()
+        self.solved_ms = 1e3 * (time.perf_counter() - start)
+        return change
+
+    def _collect(self) -> C:
+        """Wait for the job that is out, and return its change, or raise what the stage raised."""
+        assert self._future is not None, f"{self.name}: no job is out"
+        future = self._future
+        try:
+            return future.result()
+        finally:
+            if future.done():  # else Ctrl-C was pressed while waiting: it is still out
+                self._forget()
+
+    def _forget(self) -> None:
+        """Forget the job that is out."""
+        self._future = None
+
+    def close(self) -> None:
+        """End the thread and forget the job that is out; a later start makes a new one."""
+        self._forget()
+        if self._thread is not None:
+            self._thread.shutdown(wait=True)
+            self._thread = None
+
+
+class Lane(_Line[Change]):
+    """A stage beside the tracker, with at most one job out.
+
+    Args:
+        name: for timing and for the thread.
+        stage: mapper or closer.
+
+    Attributes:
+        keyframe: the one whose job is out, or None.
+    """
+
+    def __init__(self, name: str, stage: Mapper | Closer) -> None:
+        super().__init__(name)
+        self._stage = stage
+        self.keyframe: Keyframe | None = None
 
     def start(self, keyframe: Keyframe) -> bool:
         """Let the stage read the map, and solve what it found to do in its thread.
@@ -130,7 +178,7 @@ class Lane:
         Returns:
             Whether there is something to do.
         """
-        assert self._future is None, f"{self.name}: a job is out"
+        assert not self.is_out, f"{self.name}: a job is out"
         job = self._stage.add(keyframe)
         if job is not None:
             self.begin(keyframe, job)
@@ -138,15 +186,8 @@ class Lane:
 
     def begin(self, keyframe: Keyframe, job: Job) -> None:
         """Solve a job in the stage's thread; the one before it must have been collected."""
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
-        self.keyframe, self._future = keyframe, self._thread.submit(self._solve, job)
-
-    def _solve(self, job: Job) -> Change:
-        start = time.perf_counter()
-        change = job.solve()
-        self.solved_ms = 1e3 * (time.perf_counter() - start)
-        return change
+        self.keyframe = keyframe
+        self._begin(job.solve)
 
     def collect(self) -> tuple[Keyframe, Change]:
         """Wait for the job that is out.
@@ -157,52 +198,27 @@ class Lane:
         Raises:
             Exception: what the stage raised; the job is not out any more.
         """
-        assert self._future is not None, f"{self.name}: no job is out"
-        assert self.keyframe is not None
-        keyframe, future = self.keyframe, self._future
-        try:
-            change = future.result()
-        finally:
-            if future.done():  # else Ctrl-C was pressed while waiting: it is still out
-                self.keyframe, self._future = None, None
-        return keyframe, change
+        keyframe = self.keyframe
+        assert keyframe is not None, f"{self.name}: no job is out"
+        return keyframe, self._collect()
 
-    def close(self) -> None:
-        """End the thread and forget the job that is out; a later start makes a new one."""
-        self.keyframe, self._future = None, None
-        if self._thread is not None:
-            self._thread.shutdown(wait=True)
-            self._thread = None
+    def _forget(self) -> None:
+        super()._forget()
+        self.keyframe = None
 
 
-class Sideline:
+class Sideline(_Line[LongChange]):
     """A stage aside of all others, whose job is given up where another one is begun.
 
     Args:
         name: for timing and for the thread.
         stage: the adjuster.
-
-    Attributes:
-        name: of the line.
-        solved_ms: milliseconds that the last job was solved in.
     """
 
     def __init__(self, name: str, stage: Adjuster) -> None:
-        self.name, self._stage = name, stage
-        self.solved_ms = 0.0
-        self._future: Future[LongChange] | None = None
+        super().__init__(name)
+        self._stage = stage
         self._stop = threading.Event()
-        self._thread: ThreadPoolExecutor | None = None
-
-    @property
-    def is_out(self) -> bool:
-        """Whether a job is out."""
-        return self._future is not None
-
-    @property
-    def is_solved(self) -> bool:
-        """Whether a job is out whose change, or whose error, is there."""
-        return self._future is not None and self._future.done()
 
     def add(self, keyframe: Keyframe, has_closed: bool) -> LongJob | None:
         """Let the stage take notice of a keyframe; give up the job that is out if it closed a loop.
@@ -231,19 +247,15 @@ class Sideline:
         self.drop()
         if not reads_beside:
             job.read()
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"odomap {self.name}")
-        self._stop = threading.Event()
-        self._future = self._thread.submit(self._solve, job, self._stop, reads_beside)
-        return job.size if not reads_beside else 0
+        stop = self._stop = threading.Event()
 
-    def _solve(self, job: LongJob, stop: threading.Event, reads: bool) -> LongChange:
-        start = time.perf_counter()
-        if reads:
-            job.read()
-        change = job.solve(stop)
-        self.solved_ms = 1e3 * (time.perf_counter() - start)
-        return change
+        def solve() -> LongChange:
+            if reads_beside:
+                job.read()
+            return job.solve(stop)
+
+        self._begin(solve)
+        return job.size if not reads_beside else 0
 
     def wait(self, seconds: float) -> None:
         """Wait for the job that is out, but no longer than that."""
@@ -256,22 +268,14 @@ class Sideline:
         Raises:
             Exception: what the stage raised; the job is not out any more.
         """
-        assert self._future is not None, f"{self.name}: no job is out"
-        future = self._future
-        try:
-            return future.result()
-        finally:
-            if future.done():
-                self._future = None
+        return self._collect()
 
     def drop(self) -> None:
         """Give up the job that is out: nobody will learn what it found, and it ends soon."""
         self._stop.set()
-        self._future = None
+        self._forget()
 
     def close(self) -> None:
         """End the thread, and give up the job that is out; a later start makes a new one."""
-        self.drop()
-        if self._thread is not None:
-            self._thread.shutdown(wait=True)
-            self._thread = None
+        self._stop.set()
+        super().close()

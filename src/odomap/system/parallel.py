@@ -181,8 +181,8 @@ class ParallelWorker(Worker):
                 self._collect(index)
         job = self.stages.closer.last() if self.stages.closer else None
         if job is not None and self._last is not None:
-            lane.begin(self._last, job)
-            self._collect(index)
+            self._lanes[-1].begin(self._last, job)
+            self._collect(len(self._lanes) - 1)
 
     def _begin_keyframe(self) -> None:
         """Make the keyframe that the tracker asked for, and start what it asks for."""
