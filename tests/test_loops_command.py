@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,6 +116,20 @@ def test_a_keyframe_that_nobody_told_of_is_found_in_the_map():
     book.add(Loop(1, 0, np.eye(4), 50, True))
     book.add(Loop(9, 8, np.eye(4), 50, True))
     assert [record.stamp_ns for record in book.records([])] == [77, 0]
+
+
+def told(frame_id, stamp_ns):
+    return SimpleNamespace(frame_id=frame_id, stamp_ns=stamp_ns)
+
+
+def test_keyframes_that_were_culled_before_anybody_told_of_them_have_their_times():
+    m, book = book_of([0, 1], START)
+    m.add_keyframe(Keyframe(2, START + 20), np.eye(4))
+    m.cull_keyframes([2])
+    book.add(Loop(3, 2, np.eye(4), 4, False, "no", stamps_ns=(START + 30, START + 20)))
+    (record,) = book.records([told(5, START + 20), told(7, START + 30)])
+    assert (record.frame, record.matched_frame) == (7, 5)
+    assert (record.stamp_ns, record.matched_stamp_ns) == (START + 30, START + 20)
 
 
 def test_nobody_looks_nobody_notes():
@@ -247,6 +262,19 @@ def test_a_single_camera_s_table_has_no_metres_but_a_scale(tmp_path, cli):
 def test_a_keyframe_of_the_map_before_has_no_frame(tmp_path, cli):
     *_, line = listed(tmp_path, cli, record(matched_frame=-1))
     assert "keyframe 3 of the map before" in line
+
+
+def test_a_loop_that_a_later_one_contradicts_is_told(tmp_path, cli):
+    old, new = record(), record(keyframe_id=300, frame=900, stamp_ns=START + 90_000_000_000)
+    lines = listed(tmp_path, cli, old, replace(new, doubts=((120, 3), (8, 1))))
+    assert lines[2].endswith("not believed any more: contradicts that at 90.00 s (frame 900)")
+    assert lines[3].endswith(
+        "contradicts the one at 40.20 s (frame 402); contradicts that of keyframes 8 and 1 of the "
+        "map before"
+    )
+    many = replace(new, doubts=tuple((k, 1) for k in range(5)))
+    *_, line = listed(tmp_path, cli, many)
+    assert "keyframes 0 and 1, 1 and 1, 2 and 1 and 2 more of the map before" in line
 
 
 def test_nothing_found_is_a_sentence(tmp_path, cli):

@@ -49,6 +49,8 @@ class LoopBook:
 
     def add(self, loop: "Loop") -> None:
         """Note what was decided."""
+        if loop.stamps_ns is not None:
+            self._stamps.update(zip((loop.keyframe_id, loop.matched_id), loop.stamps_ns))
         for k in (loop.keyframe_id, loop.matched_id):
             if k not in self._stamps:  # made with another one, of which alone was told
                 with self._map.lock:
@@ -93,4 +95,5 @@ class LoopBook:
             turned=loop.turned,
             rescaled=loop.rescaled,
             T_matched_keyframe=loop.T_matched_keyframe,
+            doubts=loop.doubts,
         )

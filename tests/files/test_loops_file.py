@@ -52,6 +52,17 @@ def test_there_and_back(tmp_path: Path) -> None:
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "loops.json").read_bytes()
 
 
+def test_what_a_loop_makes_doubtful_is_kept_and_an_older_file_says_nothing(tmp_path: Path) -> None:
+    file, doubting = tmp_path / "loops.json", replace(CLOSED, keyframe_id=9, doubts=((120, 3),))
+    write_loops(file, replace(LOG, records=(CLOSED, doubting)))
+    assert [record.doubts for record in read_loops(file).records] == [(), ((120, 3),)]
+    content = json.loads(file.read_text())
+    for candidate in content["candidates"]:
+        del candidate["doubts"]
+    file.write_text(json.dumps(content))
+    assert [record.doubts for record in read_loops(file).records] == [(), ()]
+
+
 def test_no_candidate_is_an_empty_list(tmp_path: Path) -> None:
     write_loops(tmp_path / "loops.json", replace(LOG, records=()))
     assert read_loops(tmp_path / "loops.json").records == ()
@@ -100,6 +111,10 @@ def change(**fields: object) -> dict[str, object]:
         (change(T_matched_keyframe=[[1e200] * 4] * 4), "finite numbers"),
         (change(T_matched_keyframe=[[None] * 4] * 4), "finite numbers"),
         (change(T_matched_keyframe=7), "four rows"),
+        (change(doubts=7), "doubts must be a list of pairs"),
+        (change(doubts=[[1, 2, 3]]), "doubts must be a list of pairs"),
+        (change(doubts=[[1, -2]]), "doubts must hold whole numbers"),
+        (change(doubts=[[1, True]]), "doubts must hold whole numbers"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path: Path, fields: dict[str, object], says: str) -> None:

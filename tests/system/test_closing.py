@@ -301,6 +301,21 @@ def test_keyframes_that_go_are_forgotten_and_their_loops_stay(vocabulary):
     assert circuit.errors()[-1] < 0.06
 
 
+def test_a_loop_says_which_earlier_ones_it_contradicts_and_when_its_keyframes_were(vocabulary):
+    circuit = Circuit(around(80), Walls.make(), seed=1)
+    closer, m = closer_of(circuit, vocabulary), circuit.map
+    for _ in range(45):
+        closer.add(circuit.add()).solve().write(m)
+    T = se3_inverse(circuit.true[5]) @ circuit.true[40]
+    T[:3, 3] += 3.0
+    m.add_edge(5, 40, T, 1e4 * np.eye(6), "loop")  # what nobody should have believed
+    m.cull_keyframes([40])
+    (loop,) = go_until_closed(circuit, closer).loops
+    assert loop.doubts == ((40, 5),)
+    ends = loop.keyframe_id, loop.matched_id
+    assert loop.stamps_ns == tuple(m.keyframe(k).stamp_ns for k in ends)
+
+
 def run(vocabulary, seed):
     circuit = Circuit(around(75), Walls.make(), seed=seed)
     changes = go(circuit, closer_of(circuit, vocabulary))

@@ -331,7 +331,7 @@ def test_lost_for_long_a_new_piece_begins_and_is_merged_when_the_camera_is_back(
 def test_no_piece_is_moved_further_than_its_camera_can_have_come(with_scale, metres, radians, said):
     """The newer piece is unsure by a metre and half a radian: it was lost for a second."""
     Ts = np.stack([np.eye(4)] * 2)
-    none = LoopEdges(*(np.zeros((0, *shape)) for shape in ((), (), (4, 4), (), (6, 6))))
+    none = LoopEdges(*(np.zeros((0, *shape)) for shape in ((), (), (4, 4), (), (6, 6), (2,))))
     sure = np.stack([1e-6 * np.eye(6), np.diag([1.0] * 3 + [0.25] * 3)])
     before = Essentials(
         np.arange(2), Ts, np.ones(2), sure, np.full(2, -1), sure, np.zeros((0, 2), int), none, 0

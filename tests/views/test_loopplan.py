@@ -158,6 +158,20 @@ def test_one_that_came_back_to_a_map_before(report_of: Make) -> None:
     assert "keyframe 5 of the map before" in body
 
 
+def test_a_loop_that_is_not_believed_any_more_says_so(report_of: Make) -> None:
+    path, view = view_of(closed(100, 2), closed(190, 2, doubts=((100, 2),)))
+    body = loops_section(report_of(4, trajectory=path, truth=None, loops=view))
+    assert "not believed any more: contradicts that at 19.00 s (frame 190)" in body
+    assert "contradicts the one at 10.00 s (frame 100)" in body
+
+
+def test_no_keyframe_is_of_frame_minus_one(report_of: Make) -> None:
+    path, view = view_of(closed(), replace(closed(190, 2), frame=-1))
+    body = loops_section(report_of(4, trajectory=path, truth=None, loops=view))
+    assert "frame -1" not in body
+    assert "keyframe 190 of the map before" in body
+
+
 def test_a_frame_that_nobody_told_is_where_it_is_now() -> None:
     path, view = view_of(closed())
     late = replace(view.live.rows(np.arange(20, FRAMES)))

@@ -101,7 +101,8 @@ def _row(loops: "LoopLog", record: "LoopRecord") -> list[str]:
     before = _when(loops, record.matched_frame, record.matched_stamp_ns, record.matched_id)
     decided = "rejected" if record.reason else "merged" if record.merges else "closed"
     moved = moved_text(record, loops.is_metric) if record.is_accepted else "-"
-    return [decided, back, before, f"{record.num_inliers:7d}", moved, record.reason]
+    said = "; ".join(loops.doubts(record)) if record.is_accepted else record.reason
+    return [decided, back, before, f"{record.num_inliers:7d}", moved, said]
 
 
 def _when(loops: "LoopLog", frame: int, stamp_ns: int, keyframe_id: int) -> str:

@@ -39,6 +39,8 @@ VERSION = 1
 MOST_BYTES = 1 << 26
 LONGEST = 2000
 """Letters of a text at most."""
+FEW = 3
+"""Loops that are named in a line."""
 LARGEST = 1e100
 ROTATION_TOLERANCE = 1e-6
 
@@ -63,6 +65,8 @@ class LoopRecord:
         rescaled: units of the keyframe after it per unit before.
         T_matched_keyframe: (4, 4) measured pose of the keyframe in the matched one, in its units;
             the identity where none was found.
+        doubts: loops closed before that contradict it and are not believed any more, each by the
+            keyframe that came back and the one it came back to.
     """
 
     keyframe_id: int
@@ -79,6 +83,12 @@ class LoopRecord:
     turned: float
     rescaled: float
     T_matched_keyframe: NDArray[np.float64]
+    doubts: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """The keyframe that came back, and the one it came back to."""
+        return self.keyframe_id, self.matched_id
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +117,40 @@ class LoopLog:
         """Those that were not."""
         return tuple(record for record in self.records if not record.is_accepted)
 
+    def doubts(self, record: LoopRecord) -> tuple[str, ...]:
+        """Say in words which earlier loops a loop contradicts, and which later ones contradict it.
+
+        Args:
+            record: one that was closed.
+        """
+        closed = {other.ends: other for other in self.closed}
+        earlier = [closed[ends] for ends in record.doubts if ends in closed]
+        before = [ends for ends in record.doubts if ends not in closed]
+        later = [other for other in self.closed if record.ends in other.doubts]
+        said = [
+            f"contradicts the one at {self._at(earlier)}" if earlier else "",
+            f"contradicts {_of_the_map_before(before)}" if before else "",
+            f"not believed any more: contradicts that at {self._at(later)}" if later else "",
+        ]
+        return tuple(filter(None, said))
+
+    def _at(self, records: Sequence[LoopRecord]) -> str:
+        times = [f"{self.seconds(r.stamp_ns):.2f} s (frame {r.frame})" for r in records]
+        return _some(times)
+
     def seconds(self, stamp_ns: int) -> float:
         """Return the time of a stamp since the first frame, seconds."""
         return (stamp_ns - self.start_ns) * 1e-9
+
+
+def _of_the_map_before(loops: Sequence[tuple[int, int]]) -> str:
+    return f"that of keyframes {_some([f'{a} and {b}' for a, b in loops])} of the map before"
+
+
+def _some(words: Sequence[str]) -> str:
+    """Return the first of some words, and how many more there are."""
+    more = f" and {len(words) - FEW} more" if len(words) > FEW else ""
+    return ", ".join(words[:FEW]) + more
 
 
 def write_loops(path: str | Path, loops: LoopLog) -> None:
@@ -188,6 +229,7 @@ def _record(at: "_Checked") -> LoopRecord:
         turned=at.number("turned", 0.0),
         rescaled=at.number("rescaled", 0.0),
         T_matched_keyframe=at.pose("T_matched_keyframe"),
+        doubts=at.pairs("doubts"),
     )
     if record.is_accepted == bool(record.reason):
         raise at.error("reason", "must be there for a candidate that is refused, and only there")
@@ -234,6 +276,15 @@ class _Checked:
         if type(value) is not str or len(value) > LONGEST:
             raise self.error(name, f"must be a text of at most {LONGEST} letters")
         return "".join(c if c.isprintable() else "?" for c in value)
+
+    def pairs(self, name: str) -> tuple[tuple[int, int], ...]:
+        """Return pairs of keyframes; none where the file is older than they are."""
+        rows: Any = self._content.get(name, [])
+        if type(rows) is not list or any(type(row) is not list or len(row) != 2 for row in rows):
+            raise self.error(name, "must be a list of pairs of keyframes")
+        if any(type(k) is not int or not 0 <= k < 1 << 63 for row in rows for k in row):
+            raise self.error(name, "must hold whole numbers >= 0")
+        return tuple((a, b) for a, b in rows)
 
     def pose(self, name: str) -> NDArray[np.float64]:
         """Return a (4, 4) rigid transform."""

@@ -123,10 +123,11 @@ class SideVerifier:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A place that a keyframe may have come back to, with both sides read."""
+    """A place that a keyframe may have come back to, with both sides and their times read."""
 
     newer: LoopSide
     matched: LoopSide
+    stamps_ns: tuple[int, int]
 
 
 class LoopCloser:
@@ -186,8 +187,11 @@ class LoopCloser:
         left = [group[0] for group in there if group]
         if not left or not alive(revisits[0].keyframe_id):
             return ()
-        newer = read(self._map, revisits[0].keyframe_id)
-        return tuple(_Candidate(newer, read(self._map, k)) for k in left)
+        newer = read(self._map, k_newer := revisits[0].keyframe_id)
+        stamp_ns, at = self._map.keyframe(k_newer).stamp_ns, self._map.keyframe
+        return tuple(
+            _Candidate(newer, read(self._map, k), (stamp_ns, at(k).stamp_ns)) for k in left
+        )
 
     # ---- without the map ----
 
@@ -208,12 +212,12 @@ class LoopCloser:
             found = self.verifier.verify(newer, matched, newer.keyframe_id)
             ends = newer.keyframe_id, matched.keyframe_id
             loop = Loop(*ends, found.T_matched_keyframe, found.num_inliers, False, found.reason)
+            loop = replace(loop, stamps_ns=candidate.stamps_ns)
             if found.is_accepted:
                 tie = Tie(*ends, found)
                 corrected = correct(essentials, edges_of(essentials, (tie,)), self._with_scale)
                 same, reason = self._confirming(essentials, tie, corrected)
                 if not reason:
-                    _log_doubts(corrected)
                     loops.append(_closed(loop, essentials, corrected))
                     return loops, Closure((tie,), essentials, corrected, same)
                 loop = replace(loop, reason=reason)
@@ -335,6 +339,7 @@ def _closed(loop: Loop, before: Essentials, after: Corrected) -> Loop:
         moved=float(np.linalg.norm(T_new[:3, 3] - T[:3, 3])),
         turned=float(np.linalg.norm(so3_log(T[:3, :3].T @ T_new[:3, :3]))),
         rescaled=float(after.scales[k] / before.scales[k]),
+        doubts=tuple((int(newer), int(matched)) for newer, matched in after.doubted),
     )
 
 
@@ -363,12 +368,6 @@ def strayed(
     return f"joins two pieces of the map, but {where}: further than the camera can have come unseen"
 
 
-def _log_doubts(corrected: Corrected) -> None:
-    if corrected.num_rejected:
-        text = "%d loops closed before are not believed any more: they contradict a new one"
-        logging.getLogger(__name__).warning(text, corrected.num_rejected)
-
-
 def _log(loops: list[Loop]) -> None:
     for loop in loops:
         ends = loop.keyframe_id, loop.matched_id
@@ -376,6 +375,9 @@ def _log(loops: list[Loop]) -> None:
             text = "keyframe %d is back at %d: %d inliers, moved by %.3g%s"
             merged = ", two pieces are one" if loop.merges else ""
             logging.getLogger(__name__).info(text, *ends, loop.num_inliers, loop.moved, merged)
+            for doubted in loop.doubts:
+                text = "keyframe %d is not believed to be back at %d any more: that contradicts %d"
+                logging.getLogger(__name__).warning(text, *doubted, loop.keyframe_id)
         else:
             text = "keyframe %d is not back at %d: %s"
             logging.getLogger(__name__).info(text, *ends, loop.reason)

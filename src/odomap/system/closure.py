@@ -122,7 +122,8 @@ def _read_loops(map: Map) -> LoopEdges:
     information = np.swapaxes(Ad, 1, 2) @ edges.information[chosen] @ Ad
     information = stretched(information, 1.0 / T_p_i[1])  # now in those of p
     is_one = p == q  # both ends have come to hang from one keyframe: nothing is left to say
-    return LoopEdges(*(x[~is_one] for x in (p, q, Ts, scales, information)))
+    told = p, q, Ts, scales, information, np.stack(ends[::-1], axis=1)
+    return LoopEdges(*(x[~is_one] for x in told))
 
 
 def _held(map: Map, ids: Index) -> tuple[Index, tuple[Array, Array]]:
@@ -158,6 +159,7 @@ def edges_of(essentials: Essentials, ties: Sequence[Tie]) -> LoopEdges:
         np.array([found.T_matched_keyframe for found in measured]),
         np.array([found.scale for found in measured]),
         np.array([found.information for found in measured]),
+        np.array([(tie.keyframe_id, tie.matched_id) for tie in ties], np.int64).reshape(-1, 2),
     )
 
 

@@ -76,6 +76,8 @@ class LoopEdges(NamedTuple):
         Ts_i_j: (L, 4, 4) pose of j in i, in the units of i.
         scales_i_j: (L,) units of i per unit of j.
         information: (L, 6, 6), right tangent, in the units of i.
+        ends: (L, 2) keyframes that came back, and those they came back to, as they are called in the
+            map; where these are gone, i and j hold them.
     """
 
     i: Index
@@ -83,6 +85,7 @@ class LoopEdges(NamedTuple):
     Ts_i_j: Array
     scales_i_j: Array
     information: Array
+    ends: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +152,7 @@ class Corrected:
         scales: (K,) world units per unit of the keyframe.
         covariances: (K, 6, 6) of the poses; None where the map knew none.
         is_accepted: whether the loop is believed; if not, all is as it was.
-        num_rejected: earlier loops that are not believed any more.
+        doubted: (D, 2) ends of earlier loops that contradict the new ones: they are not believed.
         reason: why the new loop is not.
         is_believed: (L,) which of the new loops are.
         is_merging: (L,) which of the new loops tie pieces that nothing tied before.
@@ -159,7 +162,7 @@ class Corrected:
     scales: Array
     covariances: Array | None
     is_accepted: bool
-    num_rejected: int = 0
+    doubted: Index = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     reason: str = ""
     is_believed: Bool = field(default_factory=lambda: np.zeros(0, bool))
     is_merging: Bool = field(default_factory=lambda: np.zeros(0, bool))
@@ -183,10 +186,11 @@ def correct(parts: Essentials, new: LoopEdges, with_scale: bool) -> Corrected:
     doubts = np.full(sparse.num_edges, DOUBT**-2)
     inliers = find_inliers(sparse, doubts)
     is_true = inliers.is_inlier | ~sparse.is_doubted
-    num_rejected, is_believed = int((~is_true[:-count]).sum()), is_true[-count:]
-    told = num_rejected, "", is_believed, is_merging
+    is_loop_true = is_true[sparse.is_doubted]
+    doubted, is_believed = loops.ends[:-count][~is_loop_true[:-count]], is_loop_true[-count:]
+    told = doubted, "", is_believed, is_merging
     if not is_believed.any():
-        told = num_rejected, _contradiction(sparse), is_believed, is_merging
+        told = doubted, _contradiction(sparse), is_believed, is_merging
         return Corrected(parts.Ts_world_body, parts.scales, None, False, *told)
     whole = _with_covisibility(sparse.placed(inliers.Ts_world_node), parts)
     weights = np.concatenate([is_true, np.ones(whole.num_edges - len(is_true))])

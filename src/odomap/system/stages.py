@@ -62,6 +62,10 @@ class Loop:
         moved: by how much the correction moved the keyframe, world units.
         turned: by how much it turned it, radians.
         rescaled: units of the keyframe after it per unit before; 1 where scale does not drift.
+        stamps_ns: times of the two keyframes, which may be gone when somebody asks; None where
+            nobody noted them.
+        doubts: loops closed before that contradict it and are not believed any more, by keyframe
+            that came back and keyframe it came back to.
     """
 
     keyframe_id: int
@@ -74,6 +78,8 @@ class Loop:
     moved: float = 0.0
     turned: float = 0.0
     rescaled: float = 1.0
+    stamps_ns: tuple[int, int] | None = None
+    doubts: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,8 @@ def _length(metres: float, unit: str) -> str:
 def _closed(log: LoopLog, scale: float, unit: str) -> str:
     rows = []
     for n, loop in enumerate(log.closed[:MOST], 1):
-        said = "two pieces of the map became one" if loop.merges else ""
+        merged = ["two pieces of the map became one"] if loop.merges else []
+        said = "; ".join([*merged, *log.doubts(loop)])
         moved = _length(scale * loop.moved, unit), f"{math.degrees(loop.turned):.2g}°"
         rescaled = [] if log.is_metric else [f"{100.0 * (loop.rescaled - 1.0):+.1f} %"]
         cells = [f"{loop.num_inliers:,}", *moved, *rescaled, said]
@@ -127,11 +128,16 @@ def _inliers() -> str:
 
 def _ends(log: LoopLog, loop: LoopRecord) -> list[str]:
     """Return when the camera came back, and when it had been there."""
-    back = f"{log.seconds(loop.stamp_ns):.2f} s (frame {loop.frame})"
-    if loop.matched_frame < 0:
-        return [_unbroken(back), text(f"keyframe {loop.matched_id} of the map before")]
-    there = f"{log.seconds(loop.matched_stamp_ns):.2f} s (frame {loop.matched_frame})"
-    return [_unbroken(back), _unbroken(there)]
+    return [
+        _end(log, loop.frame, loop.stamp_ns, loop.keyframe_id),
+        _end(log, loop.matched_frame, loop.matched_stamp_ns, loop.matched_id),
+    ]
+
+
+def _end(log: LoopLog, frame: int, stamp_ns: int, keyframe_id: int) -> str:
+    if frame < 0:
+        return text(f"keyframe {keyframe_id} of the map before")
+    return _unbroken(f"{log.seconds(stamp_ns):.2f} s (frame {frame})")
 
 
 def _unbroken(words: str) -> str:
