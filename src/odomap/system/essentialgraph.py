@@ -76,8 +76,8 @@ class LoopEdges(NamedTuple):
         Ts_i_j: (L, 4, 4) pose of j in i, in the units of i.
         scales_i_j: (L,) units of i per unit of j.
         information: (L, 6, 6), right tangent, in the units of i.
-        ends: (L, 2) keyframes that came back, and those they came back to, as they are called in the
-            map; where these are gone, i and j hold them.
+        ends: (L, 2) keyframes that came back, and those they came back to, as the map names them;
+            where these are gone, i and j hold them.
     """
 
     i: Index
