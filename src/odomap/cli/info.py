@@ -23,8 +23,8 @@ class Info:
     """Say what a recording (frames, sensors, calibration, gaps, truth) or a map file holds."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images), a camera ('camera:0'), a
-    world.yaml, 'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
+    """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images, a laser's log, a bag), a
+    camera ('camera:0'), a world.yaml, 'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
     check: bool = False
@@ -85,7 +85,9 @@ def lines(facts: dict[str, Any]) -> list[str]:
     ]
     if facts["imu_rate_hz"]:
         rows.append(("imu", f"{facts['imu_rate_hz']:g} Hz"))
-    rows += [("lidar", name) for name in facts["lidars"]]
+    rows += [(f"lidar {lidar['name']}", _lidar(lidar)) for lidar in facts["lidars"]]
+    if facts["scans"]:
+        rows += _scans(facts["scans"])
     rows.append(("body", facts["body"] or "a frame of its own, none of these sensors"))
     rows.append(("ground truth", _truth(facts)))
     for gap in facts["gaps"][:10]:
@@ -128,6 +130,27 @@ def _camera(camera: dict[str, Any]) -> str:
     w, h = camera["resolution"]
     bend = "distorted" if any(camera["distortion"]) else "no distortion"
     return f"{camera['model']} {w}x{h}, focal {camera['focal_px'][0]:g} px, {bend}"
+
+
+def _lidar(lidar: dict[str, Any]) -> str:
+    near, far = lidar["range_m"]
+    text = f"{near:g} to {far:g} m, {lidar['rate_hz']:g} Hz"
+    if "beams" in lidar:
+        first, last = lidar["angles_deg"]
+        view = f"{lidar['beams']} beams from {first:g}° to {last:g}°, every {lidar['step_deg']:g}°"
+        text = f"{view}, {text}"
+    return text if lidar["sweep"] == "none" else f"{text}, {lidar['sweep']} sweep"
+
+
+def _scans(scans: dict[str, Any]) -> list[tuple[str, str]]:
+    code = scans["no_return_m"]
+    lost = f"{scans['share_no_return']:.2%} of the beams"
+    path = scans["odometry_path_m"]
+    return [
+        ("no return", lost if code is None else f"{lost}, written as {code:g} m"),
+        ("invalid", f"{scans['share_invalid']:.2%} of the beams"),
+        ("odometry", "none" if path is None else f"of the wheels, {path:.2f} m"),
+    ]
 
 
 def _truth(facts: dict[str, Any]) -> str:

@@ -86,6 +86,8 @@ class Frame:
         scan: 2D scan: (N,) float64 ranges in metres, NaN where invalid, inf where nothing returned.
         cloud: 3D sweep: (N, 4) float64 x, y, z in the LiDAR frame and seconds since `stamp_ns`.
         imu: the samples after the previous frame, up to and including this one's stamp.
+        odometry: (4, 4) T_odom_body by the wheels' own reckoning at this stamp; it drifts, so only
+            steps from frame to frame mean something. None where no wheels are read.
     """
 
     id: int
@@ -95,6 +97,7 @@ class Frame:
     scan: NDArray[np.float64] | None = None
     cloud: NDArray[np.float64] | None = None
     imu: ImuSamples | None = None
+    odometry: NDArray[np.float64] | None = None
 
     @property
     def stamp(self) -> float:
@@ -104,6 +107,6 @@ class Frame:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Yield the arrays of this frame (for counting bytes, or freezing them)."""
         yield from (image for image in self.images if image is not None)
-        yield from (a for a in (self.depth, self.scan, self.cloud) if a is not None)
+        yield from (a for a in (self.depth, self.scan, self.cloud, self.odometry) if a is not None)
         if self.imu is not None:
             yield from (self.imu.stamps_ns, self.imu.gyro, self.imu.accel)

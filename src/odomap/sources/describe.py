@@ -7,10 +7,12 @@ ones: no error, since recordings have them, but worth knowing, since a tracker m
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from odomap.errors import CalibrationError
-from odomap.sensors.rig import Rig
+from odomap.sensors.rig import LidarMount, Rig
 from odomap.sources.depth import DepthFiles
+from odomap.sources.scans import Beams
 from odomap.sources.source import RandomAccess, Source
 
 __all__ = ["describe"]
@@ -26,8 +28,8 @@ def describe(source: Source) -> dict[str, Any]:
 
     Returns:
         Plain numbers, texts, lists and mappings: name, format, frames, duration_s, rate_hz, gaps,
-        steps_s, cameras, stereo_baseline_m, depth, imu_rate_hz, lidars, body, details, truth,
-        skipped, notes. Frames are None where they cannot be counted, as of a live camera.
+        steps_s, cameras, stereo_baseline_m, depth, imu_rate_hz, lidars, scans, body, details,
+        truth, skipped, notes. Frames are None where they cannot be counted, as of a live camera.
     """
     rig = source.rig
     return {
@@ -49,7 +51,8 @@ def describe(source: Source) -> dict[str, Any]:
         "stereo_baseline_m": _baseline(rig),
         "depth": _depth(source),
         "imu_rate_hz": None if rig.imu is None else rig.imu.rate_hz,
-        "lidars": [mount.name for mount in rig.lidars],
+        "lidars": [_lidar(mount) for mount in rig.lidars],
+        "scans": _scans(source),
         "body": rig.body_sensor,
         "details": dict(getattr(source, "details", {})),
         "truth": _truth(source),
@@ -62,12 +65,20 @@ def _times(source: Source) -> dict[str, Any]:
     if not isinstance(source, RandomAccess) or len(source) == 0:
         return {"duration_s": None, "rate_hz": None, "steps_s": None, "gaps": []}
     stamps = source.stamps_ns
+    goes_back = bool((np.diff(stamps) < 0).any())
+    order = np.argsort(stamps, kind="stable")
+    stamps = stamps[order]
     steps = np.diff(stamps)
     if len(steps) == 0:
         return {"duration_s": 0.0, "rate_hz": None, "steps_s": None, "gaps": []}
-    usual = float(np.median(steps))
+    # A clock that jumps leaves bunches of stamps, and their median step says nothing of the rate.
+    usual = float(steps.mean() if goes_back else np.median(steps))
     gaps = [
-        {"after_frame": int(i), "stamp_s": float(stamps[i] * 1e-9), "gap_s": float(steps[i] * 1e-9)}
+        {
+            "after_frame": int(order[i]),
+            "stamp_s": float(stamps[i] * 1e-9),
+            "gap_s": float(steps[i] * 1e-9),
+        }
         for i in np.flatnonzero(steps > GAP_STEPS * usual)
     ]
     return {
@@ -75,6 +86,42 @@ def _times(source: Source) -> dict[str, Any]:
         "rate_hz": round(1e9 / usual, 3),
         "steps_s": [float(steps.min() * 1e-9), float(steps.max() * 1e-9)],
         "gaps": gaps,
+    }
+
+
+def _lidar(mount: LidarMount) -> dict[str, Any]:
+    first, last, beams = mount.angles
+    facts: dict[str, Any] = {
+        "name": mount.name,
+        "range_m": [round(float(r), 3) for r in mount.range_m],
+        "rate_hz": round(mount.rate_hz, 3),
+        "sweep": mount.sweep,
+    }
+    if beams:
+        facts |= {
+            "beams": beams,
+            "angles_deg": [round(float(np.degrees(a)), 3) for a in (first, last)],
+            "step_deg": round(float(np.degrees(last - first)) / max(beams - 1, 1), 4),
+        }
+    return facts
+
+
+def _scans(source: Source) -> dict[str, Any] | None:
+    """Return what became of the beams of a recording, and how far its wheels went."""
+    beams: Beams | None = getattr(source, "beams", None)
+    if beams is None:
+        return None
+    odometry: NDArray[np.float64] | None = getattr(source, "odometry", None)
+    path = None
+    if odometry is not None:
+        steps = np.diff(odometry[:, :3, 3], axis=0)
+        path = round(float(np.linalg.norm(steps, axis=1).sum()), 3)
+    value = beams.no_return_m
+    return {
+        "no_return_m": round(value, 4) if np.isfinite(value) else None,
+        "share_no_return": round(beams.share_no_return, 5),
+        "share_invalid": round(beams.share_invalid, 5),
+        "odometry_path_m": path,
     }
 
 

@@ -7,8 +7,11 @@ Recognised by what a folder holds, not by its name:
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
+    laser log         a file: CARMEN's (.clf, .log, also .bz2 or .gz), or Odometry and Laser lines
     live camera       a name "camera:0", "camera:0?width=640&height=480"
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
+
+Laser logs take options behind a '?': "intel.clf.bz2?odometry=off" (see `carmen`).
 
 A path that leads nowhere is answered with what stands nearest to it.
 """
@@ -19,9 +22,13 @@ from odomap.errors import InputError, nearest_name
 from odomap.sensors.rig import Rig
 from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.camera import PREFIX, CameraSource
+from odomap.sources.carmen import MESSAGES, CarmenSource
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
+from odomap.sources.logfiles import beginnings
+from odomap.sources.options import check_options, split_options
+from odomap.sources.plainlog import WORDS, PlainLogSource
 from odomap.sources.source import Source
 from odomap.sources.tum import TumSource, is_tum
 from odomap.sources.video import VideoSource, is_video
@@ -31,7 +38,8 @@ __all__ = ["SUPPORTED", "open"]
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
-    "folders of images (one, or left/ and right/), live cameras ('camera:0'), "
+    "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
+    "live cameras ('camera:0'), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
 
@@ -59,9 +67,29 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
     if isinstance(path, str) and path.startswith(PREFIX):
         return CameraSource(path, None if rig is None else load_rig(rig))
     try:
-        return _recognised(Path(path), rig)
+        place, options = split_options(path)
+        log = _log(place, rig, options)
+        if log is not None:
+            return log
+        check_options(place, options, ())
+        return _recognised(place, rig)
     except OSError as error:
         raise InputError(f"{error.filename or path}: {error.strerror or error}") from error
+
+
+def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source | None:
+    """Return the source of a laser's log, or None if a file is none."""
+    if not file.is_file() or is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
+        return None
+    words = set(beginnings(file))
+    for kinds, kind in ((MESSAGES, CarmenSource), (WORDS, PlainLogSource)):
+        if words & kinds:
+            source: Source = kind(file, None if rig is None else load_rig(rig), options)
+            return source
+    if {".clf", ".log"} & {suffix.lower() for suffix in file.suffixes}:
+        found = f"'{next(iter(words))[:20]}'" if words else "nothing"
+        raise InputError(f"{file}: is no laser log: no line begins with FLASER (found {found})")
+    return None
 
 
 def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:

@@ -71,7 +71,9 @@ class RandomAccess(Source, Protocol):
     """A source whose frames can be read in any order.
 
     Attributes:
-        stamps_ns: (len,) int64, strictly increasing: the stamps of all frames, known unread.
+        stamps_ns: (len,) int64, strictly increasing: the stamps of all frames, known unread. Logs
+            of lasers are the exception: their clocks may jump back, and frames keep the order in
+            which they were measured (no stamp comes twice; a note says how many go back).
     """
 
     stamps_ns: NDArray[np.int64]

@@ -189,6 +189,8 @@ def preset_for(rig: Rig) -> str:
     Raises:
         CalibrationError: it has no camera.
     """
+    if not rig.cameras and rig.lidars:
+        raise CalibrationError("this rig has a LiDAR and no camera: there is no preset for it yet")
     if not rig.cameras:
         raise CalibrationError("this rig has no camera: odometry needs one")
     if rig.depth is not None:
