@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleConfig
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
-from odomap.limits import Count, Positive, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
@@ -37,8 +36,9 @@ from odomap.system.culling import CullConfig, poor_landmarks, redundant_keyframe
 from odomap.system.depthbias import DepthBias
 from odomap.system.fusing import FuseConfig, Fusions, find_fusions, fused
 from odomap.system.localbundle import Adjusted, adjust_window
-from odomap.system.localmap import LocalMapConfig, median_distance, nearby
-from odomap.system.localwindow import LocalWindow, by_id
+from odomap.system.localmap import LocalMapConfig, median_distance
+from odomap.system.localpart import MappingConfig, choose_part
+from odomap.system.localwindow import LocalWindow
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
 from odomap.vision.matching import MatchConfig
@@ -48,27 +48,8 @@ __all__ = ["LocalChange", "LocalJob", "LocalMapper", "MappingConfig", "MappingSe
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-UNSURE_PX = 20.0
-"""Where landmarks may lie further off than this, what is found nearby would be something else."""
 KEPT = 3
 """Newest keyframes that are never culled: frames still hang from them."""
-
-
-@dataclass(frozen=True)
-class MappingConfig:
-    """Which part of the map is worked on when there is a new keyframe."""
-
-    size: Count = 10
-    """Keyframes adjusted: the new one and those that share most landmarks with it."""
-    fixed: Count = 10
-    """Further keyframes that see the same landmarks, and hold them in place."""
-    min_shared: Count = 15
-    """Landmarks that a keyframe must share with the new one to be adjusted with it."""
-    gate: Positive = 3.5
-    """Residual, in standard deviations, beyond which an observation is dropped."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True)
@@ -133,12 +114,13 @@ class LocalMapper:
 
     def add(self, keyframe: Keyframe) -> "LocalJob | None":
         """Take in a keyframe that is in the map, and read the window around it."""
-        snapshot = self._snapshot(keyframe.id)
-        if snapshot is None:
+        s = self._sections
+        part = choose_part(self._map, keyframe.id, self._camera, s.mapping, s.local)
+        if part is None:
             return None
-        anchor = self._anchor(keyframe.id, snapshot.keyframe_ids[snapshot.is_fixed])
-        window = self._window(snapshot, keyframe.id)
-        return LocalJob(self, self._sections, window, snapshot, anchor, self._drift(anchor))
+        window = self._window(part.snapshot, keyframe.id)
+        drift = self._drift(part.anchor_id)
+        return LocalJob(self, s, window, part.snapshot, part.anchor_id, drift)
 
     def write(self, change: "LocalChange", map: Map) -> None:
         """Write what was found into the map, and decide what has to go."""
@@ -168,45 +150,6 @@ class LocalMapper:
 
     # ---- reading ----
 
-    def _snapshot(self, keyframe_id: int) -> Snapshot | None:
-        """Copy the keyframes around a new one, what they see, and those that hold them."""
-        config = self._sections.mapping
-        shared, counts = self._map.covisible(keyframe_id)
-        neighbours = shared[counts >= config.min_shared][: config.size - 1].tolist()
-        neighbours = neighbours or shared[:1].tolist()
-        free = [keyframe_id, *neighbours]
-        seen = self._map.landmarks_of(free)
-        around = [k for k in self._map.observing(seen)[0].tolist() if k not in free]
-        held = around[: config.fixed]
-        near = self._near(keyframe_id, {*free, *held})
-        if len(free) + len(near) < 2:
-            return None
-        if not held:  # nothing else is known: the oldest one ties it all
-            held = [min(free)] if len(free) > 1 else near[:1]
-            free = [k for k in free if k not in held]
-        # All as if they were free: a snapshot tells the landmarks of those alone.
-        snapshot = self._map.snapshot([*free, *near, *held])
-        is_fixed = ~np.isin(snapshot.keyframe_ids, free)
-        anchor = int(snapshot.keyframe_ids[is_fixed][-1])
-        return replace(by_id(snapshot), is_fixed=is_fixed, anchor_id=anchor)
-
-    def _near(self, keyframe_id: int, known: set[int]) -> list[int]:
-        """Return keyframes that look at what a new one sees without sharing a landmark with it."""
-        config = self._sections.local
-        T_world_body = self._map.T_world_body(keyframe_id)
-        seen, _ = self._map.observations_of(keyframe_id)
-        distance = median_distance(self._map.points_world(seen), T_world_body[:3, 3])
-        if not self._unsure_px(keyframe_id, distance) < UNSURE_PX:
-            return []
-        near = nearby(self._map, T_world_body, distance, config)
-        return [k for k in near.tolist() if k not in known][: config.near]
-
-    def _unsure_px(self, keyframe_id: int, distance: float) -> float:
-        """Return by how many pixels landmarks so far away may lie elsewhere than a pose says."""
-        sigma = np.sqrt(np.diag(self._map.covariance(keyframe_id)))
-        across = sigma[:3].max() / distance + sigma[3:].max()
-        return float(self._camera.fx * across)
-
     def _window(self, snapshot: Snapshot, keyframe_id: int) -> LocalWindow:
         # Copies: a kernel would be compiled again for arrays that must not be written to.
         ids = snapshot.landmark_ids
@@ -227,12 +170,6 @@ class LocalMapper:
             self._sigma,
             self._bias.value,
         )
-
-    def _anchor(self, keyframe_id: int, fixed: Index) -> int:
-        """Return which of the fixed keyframes tells most about where the new one is."""
-        shared, _ = self._map.covisible(keyframe_id)
-        tied = [k for k in shared.tolist() if k in fixed]
-        return int(tied[0] if tied else fixed[0])
 
     def _drift(self, keyframe_id: int) -> Drift:
         """Return a keyframe's drift; where tracking began, what the tracker said of it."""
