@@ -70,7 +70,8 @@ class MapLocator:
         Returns:
             The pose, to be believed if enough inliers agree.
         """
-        grid = KeypointGrid.of(view.corners.keypoints, view.image.shape)
+        width, height = self._camera.resolution
+        grid = KeypointGrid.of(view.corners.keypoints, (height, width))
         rows, found, expected = self._search_for(
             view, grid, local, likely, T_world_body, self._search.first_radius_px
         )

@@ -26,13 +26,14 @@ from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.localmap import LocalMap, local_map
 from odomap.system.locating import Located
-from odomap.system.looking import Look
+from odomap.system.looking import Look, doubt
 from odomap.system.maplocating import MapLocator
 from odomap.system.passed import Passed
 from odomap.system.path import Placed
 from odomap.system.recognition import Recognizer
 from odomap.system.starting import Start, Started
 from odomap.system.tracking import Tracker
+from odomap.system.trail import Trail
 
 __all__ = ["MapTracker"]
 
@@ -92,6 +93,7 @@ class MapTracker(Tracker[LocalMap]):
         self._expected_often: list[Index] = []
         self._seen_often: list[Index] = []
         self._passed = Passed(int(map.keyframe_ids.max(initial=-1)))
+        self._trail = Trail()
 
     # ---- the local map ----
 
@@ -100,6 +102,7 @@ class MapTracker(Tracker[LocalMap]):
         self._turn_later(keyframe_id, self._map.T_world_body(keyframe_id))
         self._shown = started.reference.landmark_ids
         self._most_shown = started.count
+        self._trail.forget()
 
     def _known(self) -> LocalMap | None:
         """Return the local map, read again where the mapper has changed the map."""
@@ -217,10 +220,31 @@ class MapTracker(Tracker[LocalMap]):
             self._shown = shown
             self._expected_often.append(known.landmark_ids[located.expected_rows])
             self._seen_often.append(shown)
+            if not self._veil.is_shown:
+                self._trail.add(len(self.path) - 1, look.view, shown, self._map.epoch)
             sharing, _ = self._map.observing(shown)
             if len(sharing) and sharing[0] != known.keyframe_id:
                 self._turn_later(int(sharing[0]), located.T_world_body)
         return estimate
+
+    def place_again(self) -> None:
+        """Place the frames since the last keyframe again, in the map as it has become since.
+
+        One that cannot be found where it hangs stays there.
+        """
+        for frame in self._trail.overtaken(self._map.epoch):
+            before, view = self.path[frame.place], frame.view
+            T_world_body = self._map.place(before.keyframe_id, before.T_keyframe_body)
+            known = self._around(before.keyframe_id, T_world_body)
+            likely = known.rows_of(self._map.resolve(frame.landmark_ids))
+            located = self._locator.locate(view, known, likely, T_world_body, 0)
+            located = self._of_one_piece(known, located)
+            if not doubt(
+                located, self._tracking.min_inliers, self._coverage, view, self._eye.camera
+            ):
+                pose = located.T_world_body, located.covariance
+                after = self.path.hang(before.stamp_ns, known.keyframe_id, *pose)
+                self.path.replace(frame.place, after)
 
     # ---- keyframes ----
 
@@ -263,6 +287,7 @@ class MapTracker(Tracker[LocalMap]):
         self._shown = made.landmark_ids
         self._most_shown = located.num_inliers
         self._recognizer.keep_up()
+        self._trail.forget()
         return made.keyframe_id
 
     def _may_start_anew(self) -> bool:

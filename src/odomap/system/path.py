@@ -62,6 +62,9 @@ class Path:
     def __len__(self) -> int:
         return len(self._frames)
 
+    def __getitem__(self, place: int) -> Placed:
+        return self._frames[place]
+
     @property
     def last(self) -> Placed:
         """The last frame placed."""
@@ -95,8 +98,13 @@ class Path:
 
     def replace_last(self, frame: Placed) -> None:
         """Hang the last frame from another keyframe: the one it has become."""
-        self._measure_speeds_by(frame)
-        self._frames[-1] = frame
+        self.replace(len(self) - 1, frame)
+
+    def replace(self, place: int, frame: Placed) -> None:
+        """Hang one of the frames anew."""
+        if place == len(self) - 1:
+            self._measure_speeds_by(frame)
+        self._frames[place] = frame
 
     def append_late(self, frame: Placed) -> None:
         """Add a frame that could not be placed when it came; it is no part of the live path."""

@@ -160,6 +160,10 @@ class Slam(VisualSystem):
     def _path(self) -> Path:
         return self._tracker.path
 
+    def _come_to_rest(self) -> None:
+        if isinstance(self._tracker, MapTracker):
+            self._tracker.place_again()
+
     def _counts(self) -> Mapping[str, int]:
         return dict(self._mapper.counts)
 

@@ -168,6 +168,7 @@ class VisualSystem(ABC):
     def finish(self) -> Result:
         """Return the path as known at the end; tracking may go on afterwards."""
         self.worker.finish()
+        self._come_to_rest()
         return Result(
             self._path.trajectory(),
             self._path.trajectory_live(),
@@ -178,6 +179,10 @@ class VisualSystem(ABC):
             self._counts(),
             tuple(self._loops),
         )
+
+    def _come_to_rest(self) -> None:
+        """Do what is left when nobody changes the map any more."""
+        return
 
     def _counts(self) -> Mapping[str, int]:
         """Return what the mapper did, by name."""
