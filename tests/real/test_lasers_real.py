@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from odomap.cli import main
+from odomap.errors import InputError
+from odomap.geometry.pose import SE3
 from odomap.sensors.sync import format_stamp
+from odomap.sources.bagfile import BagFile
 from odomap.sources.describe import describe
 from odomap.sources.open import open as open_source
+from odomap.sources.transforms import FrameTree
 
 
 def test_intel(data_folder: Path) -> None:
@@ -61,3 +65,33 @@ def test_command(data_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "361 beams from -90° to 90°, every 0.5°" in out
     assert "no return      3.30% of the beams, written as 81.91 m" in out
     assert "odometry       of the wheels, 373.62 m" in out
+
+
+def test_real_bags(data_folder: Path) -> None:
+    folder = data_folder / "containers"
+    for name, counts in {
+        "tf_example.bag": {"/tf": 517, "/tf_static": 1},
+        "nav2_turtlebot.mcap": {"/odom": 2639, "/tf": 5422, "/tf_static": 1, "/amcl_pose": 135},
+        "ROS_example.bag": {"groundtruth": 12765, "S-PTAM": 5439, "ORB-SLAM": 8362},
+    }.items():
+        bag = BagFile(folder / name)
+        assert bag.is_indexed
+        assert {topic.name: topic.count for topic in bag.topics} == counts
+        with pytest.raises(InputError, match=f"{name}: holds no LaserScan; it holds "):
+            open_source(folder / name)
+
+
+def test_real_tree_of_frames(data_folder: Path) -> None:
+    bag, tree = BagFile(data_folder / "containers" / "nav2_turtlebot.mcap"), FrameTree()
+    for topic, _, message in bag.messages(["/tf", "/tf_static"]):
+        tree.add(message, topic == "/tf_static")
+    # The laser of a TurtleBot 4 stands on its shell, turned by a right angle.
+    T = tree.fixed("base_link", "rplidar_link")
+    assert T is not None
+    assert SE3(T).log()[5] == pytest.approx(np.pi / 2, abs=1e-3)
+    assert tree.fixed("base_link", "left_wheel") is None
+    wheels = tree.wheels()
+    assert wheels is not None
+    assert wheels[0] == "base_link"
+    odometry = [m.pose.pose.position.x for _, _, m in bag.messages(["/odom"])]
+    assert np.ptp(odometry) == pytest.approx(np.ptp([T[0, 3] for T in wheels[2]]), rel=0.02)

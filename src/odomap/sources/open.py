@@ -8,10 +8,11 @@ Recognised by what a folder holds, not by its name:
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
     laser log         a file: CARMEN's (.clf, .log, also .bz2 or .gz), or Odometry and Laser lines
+    bag               a ROS 1 .bag, an MCAP file, a ROS 2 bag (its folder, .mcap or .db3)
     live camera       a name "camera:0", "camera:0?width=640&height=480"
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
-Laser logs take options behind a '?': "intel.clf.bz2?odometry=off" (see `carmen`).
+Laser logs and bags take options behind a '?': "run.bag?scan=/front/scan" (see `carmen`, `bag`).
 
 A path that leads nowhere is answered with what stands nearest to it.
 """
@@ -20,6 +21,7 @@ from pathlib import Path
 
 from odomap.errors import InputError, nearest_name
 from odomap.sensors.rig import Rig
+from odomap.sources.bagfile import is_bag
 from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.camera import PREFIX, CameraSource
 from odomap.sources.carmen import MESSAGES, CarmenSource
@@ -39,6 +41,7 @@ SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
     "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
+    "bags of ROS 1 and 2 with laser scans (.bag, .mcap, .db3, or the folder of one), "
     "live cameras ('camera:0'), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
@@ -78,7 +81,12 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
 
 
 def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source | None:
-    """Return the source of a laser's log, or None if a file is none."""
+    """Return the source of a laser's log or a bag, or None if a path is none of these."""
+    if is_bag(file):
+        from odomap.sources.bag import BagSource
+
+        bag: Source = BagSource(file, None if rig is None else load_rig(rig), options)
+        return bag
     if not file.is_file() or is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
         return None
     words = set(beginnings(file))

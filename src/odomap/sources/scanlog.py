@@ -21,7 +21,7 @@ from odomap.sensors.sync import parse_stamp
 from odomap.sources.scans import TOP, Beams, mark, no_return, ordered_rows, planar
 from odomap.sources.source import Skipped
 
-__all__ = ["Table", "half_plane", "log_of", "mounted"]
+__all__ = ["Table", "half_plane", "log_of", "mounted", "rate_of"]
 
 HALF_PLANE = (180, 181, 360, 361, 720, 721)
 """Usual numbers of beams over 180 degrees."""
@@ -231,7 +231,7 @@ def log_of(
     mark(ranges, 0.0, (1 - TOP) * farthest)
     beams = Beams.of(ranges, farthest)
     reach = farthest if np.isfinite(farthest) else _largest(ranges)
-    laser = LidarMount("laser", mount, (0.0, reach), _rate(table.stamps_ns), "none", angles)
+    laser = LidarMount("laser", mount, (0.0, reach), rate_of(table.stamps_ns), "none", angles)
     odometry: NDArray[np.float64] | None = planar(np.array(table.poses)[:, -3:])
     if options.get("odometry") == "off":
         odometry = None
@@ -261,7 +261,7 @@ def _number(path: Path, options: Mapping[str, str], name: str, default: float) -
     return value
 
 
-def _rate(stamps_ns: NDArray[np.int64]) -> float:
+def rate_of(stamps_ns: NDArray[np.int64]) -> float:
     """Return the mean rate; the median step of a jumping clock says little."""
     span = int(stamps_ns.max() - stamps_ns.min())
     return (len(stamps_ns) - 1) / (span * 1e-9) if span else 0.0
