@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from odomap.files.mapfile import load_map, save_map
 from odomap.files.vocabulary import Vocabulary
 from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.states import stretched
 from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.closure import read_essentials
 from odomap.system.config import preset
 from odomap.system.loopsearch import ClosingConfig, LoopSearch
 from odomap.system.slam import Slam
@@ -165,7 +167,7 @@ def test_a_keyframe_that_was_mapped_before_a_loop_is_written_keeps_what_odometry
     carried = circuit.map.covariance(keyframe.id)
     closer.add(keyframe).solve().write(circuit.map)
     np.testing.assert_array_equal(circuit.map.covariance(keyframe.id), carried)
-    growth = closer.search.known.growth[keyframe.id]
+    growth = circuit.map.growth(keyframe.id)
     np.testing.assert_allclose(growth, np.diag(np.maximum(STEP, 1e-4) ** 2), atol=1e-9)
 
 
@@ -184,7 +186,7 @@ def test_a_keyframe_that_came_while_the_one_before_was_mapped_waits_for_its_turn
     step = se3_inverse(circuit.map.T_world_body(early.id)) @ circuit.map.T_world_body(late.id)
     Ad = se3_adjoint(se3_inverse(step))
     grown = wide - Ad @ circuit.map.covariance(early.id) @ Ad.T
-    np.testing.assert_allclose(known.growth[late.id], grown, atol=1e-12)
+    np.testing.assert_allclose(circuit.map.growth(late.id), grown, atol=1e-12)
 
 
 def test_a_tracker_that_runs_ahead_closes_the_same_loop_over_the_same_path(vocabulary):
@@ -314,6 +316,23 @@ def test_a_loop_says_which_earlier_ones_it_contradicts_and_when_its_keyframes_we
     assert loop.doubts == ((40, 5),)
     ends = loop.keyframe_id, loop.matched_id
     assert loop.stamps_ns == tuple(m.keyframe(k).stamp_ns for k in ends)
+
+
+def test_a_map_that_is_opened_again_knows_how_unsure_its_steps_were(vocabulary, tmp_path):
+    circuit = Circuit(around(90), Walls.make(), seed=1)
+    go(circuit, closer_of(circuit, vocabulary))
+    m = circuit.map
+    assert "loop" in m.edges().kind
+    save_map(tmp_path / "m.odomap", m)
+    circuit.map = again = load_map(tmp_path / "m.odomap")
+    closer = closer_of(circuit, vocabulary)
+    read = [read_essentials(map, closer.search.known).growth for map in (m, again)]
+    np.testing.assert_array_equal(*read)
+    assert np.isfinite(read[0][1:]).all()
+    # Of one that never was told nothing is made of what loops told.
+    again.set_growth(40, np.full((6, 6), np.nan))
+    closer_of(circuit, vocabulary)
+    assert np.isnan(again.growth(40)).all()
 
 
 def run(vocabulary, seed):

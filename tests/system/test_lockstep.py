@@ -206,7 +206,7 @@ def test_the_closer_writes_down_what_the_mapper_is_done_with(delays):
     list(worker.run(frames(30)))
     worker.finish()
     assert search.known.keyframe_ids.tolist() == list(range(10))
-    growths = search.known.growth[1:10]
+    growths = m.states.growths[1:10]
     assert np.isfinite(growths).all()  # NaN until it is mapped
     np.testing.assert_allclose(growths[:, 3:, 3:], np.tile(np.eye(3), (9, 1, 1)))
 

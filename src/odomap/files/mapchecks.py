@@ -78,7 +78,7 @@ def _keyframes(c: Columns, numbers: Numbers) -> None:
     _placements("states", c["states/Ts_world_body"], c["states/scales"], present)
     stub = status == STUB
     _placements("tree", c["tree/Ts_parent_self"], c["tree/scales_parent_self"], stub)
-    for name in ("v_world_body", "biases", "covariances"):
+    for name in ("v_world_body", "biases", "covariances", "growths"):
         _need(not c[f"states/{name}"][~present].any(), f"states/{name}: of an id not in use")
     for name in ("v_world_body", "biases"):
         _need(not np.isinf(c[f"states/{name}"]).any(), f"states/{name}: an entry is infinite")

@@ -49,7 +49,7 @@ from odomap.files.zipreader import FREE_BYTES, ZipReader
 from odomap.files.zipwriter import ZipWriter
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.maps.tree import ALIVE
+from odomap.maps.tree import ABSENT, ALIVE
 from odomap.sensors.rig import Rig
 from odomap.version import __version__
 
@@ -233,6 +233,11 @@ class MapFile:
         columns = {name: self.array(name) for name in ARRAYS if name in self.arrays}
         if self.version < 2:
             columns["landmarks/expected"] = columns["landmarks/seen"].copy()
+        if self.version < 3:
+            is_used = columns["tree/status"] != ABSENT
+            columns["states/growths"] = np.where(
+                is_used[:, None, None], np.full((6, 6), np.nan), 0.0
+            )
         try:
             budget = FREE_BYTES + self.size
             check_tables(columns, self.numbers, len(self.edge_kinds), budget)

@@ -1,6 +1,6 @@
 """The manifest of a map file: which version, which arrays, and the numbers beside them.
 
-    {"odomap_map": 2, "odomap": "0.6", "counts": {...}, "numbers": {...}, "edge_kinds": [...],
+    {"odomap_map": 3, "odomap": "0.6", "counts": {...}, "numbers": {...}, "edge_kinds": [...],
      "rig": {...} or null, "settings": {...},
      "arrays": {"states/scales": {"dtype": "<f8", "shape": [120], "crc32": 305419896}, ...}}
 
@@ -20,7 +20,7 @@ from odomap.files.zipreader import ZipReader
 
 __all__ = ["VERSION", "Manifest"]
 
-VERSION = 2
+VERSION = 3
 MOST_KINDS = 256
 LONGEST_KIND = 64
 LONGEST = 1 << 31

@@ -8,7 +8,8 @@ A shape names its lengths by letters, and a letter means the same number whereve
 Payloads are packed: the rows of all keyframes that have one, one after the other, beside a table
 (keyframe, rows, width, checksum). N counts those keyframes, P their rows, Q their bytes or numbers
 where rows have a width of their own. A file of version 1 has no `landmarks/expected`: it is read as
-`landmarks/seen`. See docs/formats.md for what each array means.
+`landmarks/seen`. Before version 3 there was no `states/growths`: none is known. See docs/formats.md
+for what each array means.
 """
 
 from collections.abc import Mapping
@@ -70,6 +71,7 @@ ARRAYS: Mapping[str, Array] = MappingProxyType(
         "states/v_world_body": Array("<f8", ("K", 3)),
         "states/biases": Array("<f8", ("K", 6)),
         "states/covariances": Array("<f8", ("K", 6, 6)),
+        "states/growths": Array("<f8", ("K", 6, 6), since=3),
         "tree/status": Array("|u1", ("K",)),
         "tree/parent": Array("<i8", ("K",)),
         "tree/created": Array("<i8", ("K",)),

@@ -94,6 +94,7 @@ class Skeleton:
             self.states.scales[k] = scale
             self.states.v_world_body[k] = np.nan if v_world_body is None else v_world_body
             self.states.covariances[k] = np.nan if covariance is None else covariance
+            self.states.growths[k] = np.nan
             self._keyframes[k] = keyframe
             self._next_keyframe = max(self._next_keyframe, k + 1)
             self._newest = k
@@ -177,6 +178,20 @@ class Skeleton:
         """Write the (n, 6, 6) covariances, or one (6, 6), of keyframes."""
         with self.lock:
             self.states.covariances[self._all_known(keyframe_ids)] = covariances
+            self.version += 1
+
+    def growth(self, keyframe_id: int) -> NDArray[np.float64]:
+        """Return the (6, 6) by which a keyframe is less sure than its parent, NaN where unknown.
+
+        As odometry said when it was mapped (`odomap.maps.growth`); loops have no part in it.
+        """
+        with self.lock:
+            return np.array(self.states.growths[self._known(keyframe_id)])
+
+    def set_growth(self, keyframe_id: int, growth: NDArray[np.float64]) -> None:
+        """Write the (6, 6) by which a keyframe is less sure than its parent, in its own units."""
+        with self.lock:
+            self.states.growths[self._known(keyframe_id)] = growth
             self.version += 1
 
     def add_edge(

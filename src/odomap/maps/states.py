@@ -22,7 +22,7 @@ from odomap.maps.columns import grown
 
 __all__ = ["States", "act", "act_inverse", "compose", "inverse", "stretched"]
 
-_COLUMNS = ("Ts_world_body", "scales", "v_world_body", "biases", "covariances")
+_COLUMNS = ("Ts_world_body", "scales", "v_world_body", "biases", "covariances", "growths")
 
 Placement = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -86,6 +86,8 @@ class States:
         biases: (K, 6) gyroscope (rad/s) and accelerometer (m/s²) biases.
         covariances: (K, 6, 6) of T_world_body, tangent (translation, rotation), right update; NaN
             where unknown.
+        growths: (K, 6, 6) by what each is less sure than its parent (`growth`), in its own units;
+            NaN where unknown, and until somebody has told.
     """
 
     def __init__(self) -> None:
@@ -95,6 +97,7 @@ class States:
         self._velocities = np.zeros((0, 3))
         self._biases = np.zeros((0, 6))
         self._covariances = np.zeros((0, 6, 6))
+        self._growths = np.zeros((0, 6, 6))
 
     def __len__(self) -> int:
         return self._rows
@@ -106,6 +109,7 @@ class States:
         self._velocities = grown(self._velocities, rows)
         self._biases = grown(self._biases, rows)
         self._covariances = grown(self._covariances, rows)
+        self._growths = grown(self._growths, rows)
         self._rows = max(self._rows, rows)
 
     @property
@@ -132,6 +136,11 @@ class States:
     def covariances(self) -> NDArray[np.float64]:
         """(K, 6, 6) covariances, a view that may be written."""
         return self._covariances[: self._rows]
+
+    @property
+    def growths(self) -> NDArray[np.float64]:
+        """(K, 6, 6) growths, a view that may be written."""
+        return self._growths[: self._rows]
 
     def twin(self) -> "States":
         """Return the same table, copied."""

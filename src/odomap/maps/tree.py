@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
+from odomap.maps.growth import hand_on
 from odomap.maps.states import Placement, States, compose, inverse
 
 __all__ = ["ABSENT", "ALIVE", "STUB", "Tree"]
@@ -146,6 +147,7 @@ class Tree:
         holder = int(self.parent[keyframe])
         if holder < 0:
             holder = int(children[np.argmin(self.created[children])])
+        hand_on(states, keyframe, holder, children)
         self.parent[children] = np.where(children == holder, self.parent[keyframe], holder)
         moved = np.r_[keyframe, stubs]
         placed = self.placements(states, moved)

@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 from odomap.backend.graphs.graphproblem import import_group
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse, se3_log, so3_log
-from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import (
@@ -158,8 +157,6 @@ class LoopCloser:
         self._waiting: Tie | None = None
         import_group("Sim3" if with_scale else "SE3")
         search.index(search.follow(map))
-        if LOOP in map.edges().kind:
-            search.known.untell_shrunk()
 
     def add(self, keyframe: Keyframe) -> "ClosingJob":
         """Take in a keyframe that is mapped, and read both sides of the last candidates.

@@ -58,16 +58,18 @@ class Reading:
     Attributes:
         snapshot: of all keyframes.
         covariances: (K, 6, 6).
+        growth: (K, 6, 6) by what each is less sure than its parent.
         loops: closed before, by keyframe ids.
-        parent, growth, pairs: of `Covisibility`, of all keyframes there ever were.
+        parent: (R,) of all keyframes there ever were, −1 for none.
+        pairs: of `Covisibility`.
         begins: (n,) keyframes that begin a piece of the map.
     """
 
     snapshot: Snapshot
     covariances: Array
+    growth: Array
     loops: LoopEdges
     parent: Index
-    growth: Array
     pairs: Index
     begins: Index
 
@@ -77,14 +79,14 @@ class Reading:
         row = np.full(len(self.parent) + 1, -1)
         row[ids] = np.arange(len(ids))
         pairs, parent = row[self.pairs], self.parent.copy()
-        parent[self.begins[self.begins < len(parent)]] = -1  # a piece may begin later
+        parent[self.begins] = -1
         return Essentials(
             ids,
             self.snapshot.Ts_world_body,
             self.snapshot.scales,
             self.covariances,
             row[parent[ids]],
-            self.growth[ids],
+            self.growth,
             pairs[(pairs >= 0).all(axis=1)],
             self.loops._replace(i=row[self.loops.i], j=row[self.loops.j]),
             self.snapshot.version,
@@ -101,11 +103,10 @@ def read_essentials(map: Map, known: Covisibility) -> Reading:
     with map.lock:
         ids = map.keyframe_ids
         snapshot = map.snapshot(ids[np.isin(ids, known.keyframe_ids)], landmarks=False)
-        covariances = map.states.covariances[snapshot.keyframe_ids]
-        loops, begins = _read_loops(map), beginnings(map)
-    growth = known.growth.copy()
-    parts = known.parent.copy(), growth, known.pairs(), begins
-    return Reading(snapshot, covariances, loops, *parts)
+        ids = snapshot.keyframe_ids
+        sure, growth = map.states.covariances[ids], map.states.growths[ids]
+        parts = _read_loops(map), map.tree().parent, known.pairs(), beginnings(map)
+    return Reading(snapshot, sure, growth, *parts)
 
 
 def _read_loops(map: Map) -> LoopEdges:

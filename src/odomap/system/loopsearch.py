@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.limits import Count, check_limits
+from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
@@ -100,7 +101,10 @@ class LoopSearch:
         self._carried: dict[int, Carried] = {}
 
     def follow(self, map: Map, newest: int | None = None) -> News:
-        """Write down which keyframes of a map went and came.
+        """Write down which keyframes of a map went and came, and in the map how unsure steps were.
+
+        Of a map that is opened with loops in it covariances say what loops told: where it does not
+        know how unsure a step was (`maps/growth`), that stays unknown.
 
         Args:
             map: what is followed.
@@ -113,13 +117,14 @@ class LoopSearch:
         come = alive[~np.isin(alive, known)].tolist()
         for k in gone:
             self.known.cull(k)
-        stale = []
+        stale, told = [], len(known) > 0 or LOOP not in map.edges().kind
         for k in come:
             carried, of_parent, is_stale = self._carried.pop(k, None), None, False
             if carried is not None:  # a mapper that did not know of the loop may have spoken since
                 is_stale = not np.array_equal(carried.own, map.covariance(k), equal_nan=True)
                 of_parent = carried.parent_before if is_stale else carried.parent
-            self.known.add(keyframe := acquaint(map, k, of_parent))
+            self.known.add(keyframe := acquaint(map, k, of_parent, told))
+            map.set_growth(k, keyframe.growth)
             stale += [keyframe] if is_stale else []
         recent = alive[-self._config.recent :]
         return News(gone, [map.keyframe(k) for k in come], stale, recent)
