@@ -225,6 +225,23 @@ def in_pieces(true, begins, rng=None, scale=1.0):
     return replace(parts, pairs=parts.pairs[~is_far])
 
 
+@pytest.mark.parametrize("off", [0.0, 1.0])
+def test_where_nobody_told_a_piece_is_as_unsure_as_its_own_steps_are_long(off):
+    """One camera's pieces differ in scale; what the other is like changes nothing."""
+    small = circle(40, 0.2)
+    Ts = drifted(small, None, scale=0.1)
+    Z = se3_inverse(small[0]) @ small[-1]
+    Z[0, 3] += off
+    found = []
+    for count in (0, 60):
+        parts = essentials(np.concatenate([circle(60)[:count], Ts]), pairs=np.zeros((0, 2), int))
+        parts.parent[count] = -1
+        parts.growth[:] = parts.covariances[:] = np.nan
+        found.append(correct(parts, loop(Z, (count, count + 39)), True))
+    assert [one.is_accepted for one in found] == [off == 0.0] * 2
+    np.testing.assert_allclose(*(one.Ts_world_body[-40:] for one in found), atol=1e-6)
+
+
 @pytest.mark.parametrize(("with_scale", "scale"), [(False, 1.0), (True, 1.0), (True, 0.4)])
 def test_a_loop_between_two_pieces_moves_all_of_the_newer_one(with_scale, scale):
     true = circle(80)

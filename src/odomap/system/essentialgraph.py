@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.descent import SolverConfig
-from odomap.backend.graphs.components import find_components
+from odomap.backend.graphs.components import connected_components, find_components
 from odomap.backend.graphs.covariances import GraphCovariances
 from odomap.backend.graphs.gnc import find_inliers
 from odomap.backend.graphs.posegraph import Group, PoseGraph
@@ -291,29 +291,39 @@ def _is_across(parts: Essentials) -> Bool:
 
 def _step_information(parts: Essentials, steps: Array, child: Index, with_scale: bool) -> Array:
     """Return the information of tree edges, (n, k, k), from how odometry grew less sure."""
-    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    length = float(np.median(lengths[lengths > 0.0])) if (lengths > 0.0).any() else 1.0
-    untold = np.diag(np.repeat([(STEP_LENGTH * length) ** 2, STEP_ANGLE**2], 3))
-    growth = parts.growth[child].copy()
-    growth[~np.isfinite(growth).all(axis=(1, 2))] = untold
-    kept = _positive(growth, np.sqrt(np.diag(untold)))
+    sigma = np.full((len(child), 6), STEP_ANGLE)
+    sigma[:, :3] = STEP_LENGTH * _usual_lengths(parts, steps, child)[:, None]
+    untold = sigma[:, :, None] ** 2 * np.eye(6)
+    growth = parts.growth[child]
+    is_told = np.isfinite(growth).all(axis=(1, 2), keepdims=True)
+    kept = _positive(np.where(is_told, growth, untold), sigma)
     information = np.asarray(np.linalg.inv(kept + FLOOR**2 * untold), np.float64)
     information = 0.5 * (information + np.swapaxes(information, 1, 2))
     return _with_log_scale(information, STEP_SCALE**-2, with_scale)
 
 
+def _usual_lengths(parts: Essentials, steps: Array, child: Index) -> Array:
+    """Return of each tree edge (n,) the median length in its piece, which has units of its own."""
+    piece = connected_components(len(parts.keyframe_ids), parts.parent[child], child)[child]
+    lengths, usual = np.linalg.norm(steps[:, :3, 3], axis=1), np.ones(len(child))
+    for one in np.unique(piece[lengths > 0.0]).tolist():
+        usual[piece == one] = np.median(lengths[(piece == one) & (lengths > 0.0)])
+    return usual
+
+
 def _positive(growth: Array, unit: Array) -> Array:
-    """Return the nearest positive semidefinite (n, 6, 6) with the same trace in some units (6,).
+    """Return the nearest positive semidefinite (n, 6, 6) with the same trace in units (n, 6).
 
     Errors that go on as they were, of the calibration, make a covariance grow by g δᵀ + δ gᵀ, which
     is indefinite; a walk at random that is as unsure in the end grows by its trace.
     """
-    scaled = 0.5 * (growth + np.swapaxes(growth, 1, 2)) / (unit[:, None] * unit)
+    units = unit[:, :, None] * unit[:, None, :]
+    scaled = 0.5 * (growth + np.swapaxes(growth, 1, 2)) / units
     values, axes = np.linalg.eigh(scaled)
     positive = np.maximum(values, 0.0)
     share = np.maximum(values.sum(axis=1), 0.0) / np.maximum(positive.sum(axis=1), 1e-300)
     kept = (axes * (share[:, None] * positive)[:, None, :]) @ np.swapaxes(axes, 1, 2)
-    return np.asarray(kept * (unit[:, None] * unit))
+    return np.asarray(kept * units)
 
 
 def _with_log_scale(information: Array, of_scale: float, with_scale: bool) -> Array:
