@@ -71,9 +71,9 @@ def test_unrecognised_folder_says_what_it_holds(tmp_path: Path) -> None:
 
 
 def test_unrecognised_file(tmp_path: Path) -> None:
-    (tmp_path / "a.bag").write_text("")
+    (tmp_path / "a.xyz").write_text("")
     with pytest.raises(InputError, match="files of this kind cannot be opened; supported are"):
-        open_source(tmp_path / "a.bag")
+        open_source(tmp_path / "a.xyz")
 
 
 def test_folder_that_may_not_be_read(kitti: Make, monkeypatch: pytest.MonkeyPatch) -> None:

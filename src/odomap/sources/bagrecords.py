@@ -76,10 +76,14 @@ def records(path: Path, unpack: dict[str, Unpack]) -> Iterator[Record]:
         elif magic.startswith(MCAP_MAGIC):
             file.seek(len(MCAP_MAGIC))
             yield from _mcap(file, {}, {}, {"": _as_is, **unpack})
-        elif magic == SQLITE_MAGIC[: len(magic)]:
+        elif SQLITE_MAGIC.startswith(magic) and magic:
             yield from _sqlite(path)
         else:
-            raise Cut("begins neither as a ROS 1 bag nor as an MCAP file or a database")
+            raise Cut(
+                "is empty"
+                if not magic
+                else "begins neither as a ROS 1 bag nor as an MCAP file or a database"
+            )
 
 
 def _as_is(data: bytes) -> bytes:

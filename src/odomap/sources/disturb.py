@@ -5,6 +5,9 @@
     cover, moving_object            a hand over the lens, a thing that moves through the view
     duplicate, kill_right           frames delivered twice, a pair whose right camera dies
     pierce_depth, roughen_depth     depth with holes (glass, black cloth, the sun), or noise
+    walkers, lose_scans             people around a laser, scans that say nothing
+    mirror_laser, turn_laser, widen a laser upside down, turned, or of another field of view
+    slip, set_back                  wheels that slip, a clock that goes back
     reverse, there_and_back         the same recording played backwards, or forth and back
 
 Each wrapper is a source like any other: it streams, its stamps increase strictly, and its truth is
@@ -31,6 +34,15 @@ from odomap.errors import InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.sources.disturb_light import exposure_jumps, overexpose
+from odomap.sources.disturb_scans import (
+    lose_scans,
+    mirror_laser,
+    set_back,
+    slip,
+    turn_laser,
+    walkers,
+    widen,
+)
 from odomap.sources.disturb_streams import duplicate, kill_right
 from odomap.sources.disturb_things import cover, moving_object
 from odomap.sources.source import Source
@@ -45,12 +57,19 @@ __all__ = [
     "exposure_jumps",
     "freeze",
     "kill_right",
+    "lose_scans",
+    "mirror_laser",
     "moving_object",
     "overexpose",
     "pierce_depth",
     "reverse",
     "roughen_depth",
+    "set_back",
+    "slip",
     "there_and_back",
+    "turn_laser",
+    "walkers",
+    "widen",
 ]
 
 PATCH_PX = 8

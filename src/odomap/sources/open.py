@@ -71,23 +71,17 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
         return CameraSource(path, None if rig is None else load_rig(rig))
     try:
         place, options = split_options(path)
-        log = _log(place, rig, options)
-        if log is not None:
-            return log
-        check_options(place, options, ())
-        return _recognised(place, rig)
+        source = _log(place, rig, options) if place.is_file() else None
+        return _recognised(place, rig, options) if source is None else source
     except OSError as error:
         raise InputError(f"{error.filename or path}: {error.strerror or error}") from error
 
 
 def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source | None:
-    """Return the source of a laser's log or a bag, or None if a path is none of these."""
+    """Return the source of a laser's log or a bag, or None if a file is none of these."""
     if is_bag(file):
-        from odomap.sources.bag import BagSource
-
-        bag: Source = BagSource(file, None if rig is None else load_rig(rig), options)
-        return bag
-    if not file.is_file() or is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
+        return _bag(file, rig, options)
+    if is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
         return None
     words = set(beginnings(file))
     for kinds, kind in ((MESSAGES, CarmenSource), (WORDS, PlainLogSource)):
@@ -100,9 +94,18 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
     return None
 
 
-def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
+def _bag(path: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
+    from odomap.sources.bag import BagSource
+
+    source: Source = BagSource(path, None if rig is None else load_rig(rig), options)
+    return source
+
+
+def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
     if not root.exists():
         raise InputError(_missing(root))
+    if options and not is_bag(root):
+        check_options(root, options, ())
     if root.is_file():
         if root.suffix.lower() in (".yaml", ".yml"):
             return _simulated(str(root), rig)
@@ -118,6 +121,8 @@ def _recognised(root: Path, rig: Rig | str | Path | None) -> Source:
     given = None if rig is None else load_rig(rig)
     if is_tum(root):
         return TumSource(root, given)
+    if is_bag(root):
+        return _bag(root, rig, options)
     calibration = given or rig_beside([root / "rig.yaml"])
     outside = next((p for p in list(root.resolve().parents)[:3] if _is_recording(p)), None)
     if outside is not None and calibration is None:

@@ -7,10 +7,13 @@ A world is given by a `WorldSpec`, by a name such as ``sim:room?seed=3&frames=10
     kind: street
     seed: 3
     frames: 200
+
+With `sensors=laser` it is a floor plan driven through by a robot with a 2D laser and wheels, and no
+images: ``sim:building?sensors=laser&seed=3&rounds=2`` (see `simulation.laserworld`).
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 from urllib.parse import parse_qsl
@@ -21,6 +24,7 @@ from numpy.typing import NDArray
 from odomap.errors import ConfigError, InputError, OdomapError, nearest_name
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
+from odomap.simulation.laserworld import LaserSpec, LaserWorld
 from odomap.simulation.world import World, WorldSpec
 from odomap.sources.source import Skipped
 
@@ -40,8 +44,8 @@ def is_simulated(data: str | Path) -> bool:
     return path.name.endswith("world.yaml") and path.is_file()
 
 
-def read_spec(data: str | Path) -> WorldSpec:
-    """Read what decides a world from a name or a file.
+def read_spec(data: str | Path) -> WorldSpec | LaserSpec:
+    """Read what decides a world from a name or a file; one for a laser where sensors says so.
 
     Args:
         data: ``sim:KIND?field=value&...``, a `world.yaml`, or a folder that holds one.
@@ -84,8 +88,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _spec(where: str, given: Mapping[str, Any]) -> WorldSpec:
-    known = {f.name: f.default for f in dataclasses.fields(WorldSpec)}
+def _spec(where: str, given: Mapping[str, Any]) -> WorldSpec | LaserSpec:
+    sensors = given.get("sensors", ())
+    asked = sensors.split(",") if _is_text(sensors) else sensors
+    kind = LaserSpec if isinstance(asked, Iterable) and "laser" in asked else WorldSpec
+    known = {f.name: f.default for f in dataclasses.fields(kind)}
     values: dict[str, Any] = {}
     for name, value in given.items():
         if name not in known:
@@ -93,9 +100,9 @@ def _spec(where: str, given: Mapping[str, Any]) -> WorldSpec:
                 f"{where}: there is no field '{name}'{nearest_name(name, known)}; "
                 f"known: {', '.join(known)}"
             )
-        values[name] = _value(where, name, value, get_type_hints(WorldSpec)[name])
+        values[name] = _value(where, name, value, get_type_hints(kind)[name])
     try:
-        return WorldSpec(**values)
+        return kind(**values)
     except OdomapError as error:
         raise ConfigError(f"{where}: {error}") from error
 
@@ -141,16 +148,27 @@ class SimulatedSource:
     Args:
         world: what decides it, a name, or a path to its `world.yaml`.
 
+    Attributes:
+        world: what is measured; one for a laser has the true plan and the true ranges, too.
+        odometry: (N, 4, 4) what the wheels say, of a world for a laser; else None.
+
     Example:
         >>> source = SimulatedSource("sim:room?seed=1&frames=2&resolution=64x48")
         >>> [frame.id for frame in source]
         [0, 1]
     """
 
-    def __init__(self, world: WorldSpec | str | Path) -> None:
-        spec = world if isinstance(world, WorldSpec) else read_spec(world)
-        self.world = World(spec)
+    def __init__(self, world: WorldSpec | LaserSpec | str | Path) -> None:
+        spec = read_spec(world) if isinstance(world, str | Path) else world
+        self.world: World | LaserWorld
+        self.odometry: NDArray[np.float64] | None = None
         self.name = f"sim:{spec.kind}?seed={spec.seed}&frames={spec.frames}"
+        if isinstance(spec, LaserSpec):
+            self.world = LaserWorld(spec)
+            self.odometry = self.world.odometry
+            self.name = f"sim:{spec.kind}?sensors=laser&seed={spec.seed}&frames={len(self.world)}"
+        else:
+            self.world = World(spec)
         self.rig = self.world.rig
         self.truth: Trajectory | None = self.world.truth
         self.stamps_ns: NDArray[np.int64] = self.world.truth.stamps_ns
