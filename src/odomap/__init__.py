@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from odomap.geometry.pose import SE2, SE3, SO3, Sim3
     from odomap.geometry.robust import Loss
     from odomap.geometry.trajectory import Trajectory
+    from odomap.lidar.cloud import Cloud
+    from odomap.lidar.registration import Registration, register
     from odomap.localize import continue_map, localize
     from odomap.maps.atlas import Atlas
     from odomap.maps.estimate import Estimate, Status
@@ -90,6 +92,7 @@ __all__ = [
     "CalibrationError",
     "Camera",
     "Certificate",
+    "Cloud",
     "Config",
     "ConfigError",
     "Estimate",
@@ -108,6 +111,7 @@ __all__ = [
     "Places",
     "PoseGraph",
     "Priors",
+    "Registration",
     "Result",
     "RgbdVO",
     "Rig",
@@ -146,6 +150,7 @@ __all__ = [
     "read_ply",
     "read_rig",
     "read_tum",
+    "register",
     "relative_covariance",
     "rpe",
     "run",
@@ -169,6 +174,7 @@ _HOMES = {
     "CalibrationError": "errors",
     "Camera": "geometry.camera",
     "Certificate": "backend.graphs.certificate",
+    "Cloud": "lidar.cloud",
     "Config": "system.config",
     "ConfigError": "errors",
     "Estimate": "maps.estimate",
@@ -187,6 +193,7 @@ _HOMES = {
     "Places": "vision.places",
     "PoseGraph": "backend.graphs.posegraph",
     "Priors": "backend.graphs.posegraph",
+    "Registration": "lidar.registration",
     "Result": "system.visual",
     "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
@@ -227,6 +234,7 @@ _HOMES = {
     "read_ply": "files.clouds",
     "read_rig": "files.rig",
     "read_tum": "files.trajectories",
+    "register": "lidar.registration",
     "relative_covariance": "backend.graphs.covariances",
     "rpe": "evaluation.metrics",
     "run": "run",

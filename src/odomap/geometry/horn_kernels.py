@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["horn_into", "warm_up"]
+__all__ = ["horn_into", "horn_rotation", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -58,6 +58,33 @@ def _jacobi(A: Array, V: Array) -> None:
 
 
 @kernel
+def horn_rotation(N: Array, V: Array, size: float, R: Array) -> bool:
+    """R of the eigenvector of the largest eigenvalue of N, given above its diagonal; destroys N.
+
+    False, and R as it was, if the two largest are the same to 1e-6 of `size`.
+    """
+    for i in range(4):
+        for j in range(i):
+            N[i, j] = N[j, i]
+    _jacobi(N, V)
+    best = 0
+    for i in range(1, 4):
+        if N[i, i] > N[best, best]:
+            best = i
+    second = -np.inf
+    for i in range(4):
+        if i != best:
+            second = max(second, N[i, i])
+    if not N[best, best] - second > 1e-6 * size:
+        return False
+    o, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - o * z), 2 * (x * z + o * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + o * z), 1 - 2 * (x * x + z * z), 2 * (y * z - o * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - o * y), 2 * (y * z + o * x), 1 - 2 * (x * x + y * y)
+    return True
+
+
+@kernel
 def horn_into(
     p: Array, q: Array, rows: Index, with_scale: bool, R: Array, t: Array, A: Array, V: Array
 ) -> float:
@@ -86,25 +113,9 @@ def horn_into(
     A[0, 0], A[1, 1], A[2, 2], A[3, 3] = xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy
     A[0, 1], A[0, 2], A[0, 3] = yz - zy, zx - xz, xy - yx
     A[1, 2], A[1, 3], A[2, 3] = xy + yx, zx + xz, yz + zy
-    for i in range(4):
-        for j in range(i):
-            A[i, j] = A[j, i]
-    _jacobi(A, V)
-    best = 0
-    for i in range(1, 4):
-        if A[i, i] > A[best, best]:
-            best = i
-    second = -np.inf
-    for i in range(4):
-        if i != best:
-            second = max(second, A[i, i])
     # On a line every turn about it is as good: two eigenvalues are the same.
-    if not A[best, best] - second > 1e-6 * np.sqrt(pp * qq) or not pp > 0.0:
+    if not pp > 0.0 or not horn_rotation(A, V, np.sqrt(pp * qq), R):
         return 0.0
-    o, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
-    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - o * z), 2 * (x * z + o * y)
-    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + o * z), 1 - 2 * (x * x + z * z), 2 * (y * z - o * x)
-    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - o * y), 2 * (y * z + o * x), 1 - 2 * (x * x + y * y)
     s = np.sqrt(qq / pp) if with_scale else 1.0
     t[0] = d - s * (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c)
     t[1] = e - s * (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c)

@@ -1,0 +1,143 @@
+"""Degeneracy: how well two clouds fix the motion between them, and in which directions they do not.
+
+The problem: a corridor fixes everything but the way along it, yet the pairs of a registration count
+there as much as elsewhere, since nearest points slide along. What fixes a motion is the surface:
+with the target's normals n and residuals r = nᵀ(q - T p), by a right update T exp(ξ),
+
+    I = (1/σ²) Σ a aᵀ,    a = (Rᵀn, p × Rᵀn),    σ² = Σ r² / (N - 6), without what is beyond 3 σ
+
+whatever the method. But normals are noisy, too: one tilted by δ (`normals`) speaks for its own
+tangent plane with weight δ², and ten thousand of them make a corridor look known. That share,
+
+    I_noise = (1/σ²) Σ Jᵀ δ² (I - n nᵀ) J,
+
+is subtracted. A motion moves the points by Σ |J ξ|² = ξᵀ K ξ, and across the surface by σ² ξᵀ I ξ;
+an eigenvalue of σ² I against K is the share of a motion that is seen. One of which less than 0.1 %
+is seen, or less than what may be chance, three times the share of the noise, is weak.
+
+Pairs are counted as if their errors were independent; where they share what a model does not
+say (curvature, motion within a sweep) the motion is less sure than I says.
+
+Reference: J. Zhang, M. Kaess, S. Singh, "On degeneracy of optimization-based state estimation
+problems", ICRA 2016.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.so3 import hat
+
+__all__ = ["Certainty", "judge"]
+
+Array = NDArray[np.float64]
+
+LEAST_SHARE = 1e-3
+NOISE_FACTOR = 3.0
+GROSS = 9.0
+"""Squared residuals beyond this many σ² do not count for σ²."""
+MEDIAN_OF_CHI2 = 0.4549
+EXACT = 1e-9
+"""Least σ, as a share of the cloud's radius: exact clouds have no noise to scale with."""
+PLANE = (0, 1, 5)
+"""What is free in the plane: x, y, θ."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certainty:
+    """How well a motion is fixed.
+
+    Attributes:
+        information: (6, 6), or (3, 3) of x, y, θ in the plane.
+        weak_directions: (K, 6) or (K, 3) tangents about the source's mean that are not fixed,
+            weakest first, each of a length that moves the points by 1 m, root mean square.
+        error: root mean square distance from the target's surface, metres.
+        reason: names the weak directions; empty if there is none.
+    """
+
+    information: Array
+    weak_directions: Array
+    error: float
+    reason: str
+
+
+def judge(
+    p: Array, e: Array, n: Array, spreads: Array, R: Array, origin: Array, planar: bool
+) -> Certainty:
+    """Say how well pairs fix a motion.
+
+    Args:
+        p: (N, 3) source points about their mean.
+        e: (N, 3) from where they lie in the target to their counterparts.
+        n: (N, 3) the target's normals there, zero where there is none.
+        spreads: (N, 4) number of points behind each normal, and their eigenvalues.
+        R: (3, 3) source to target.
+        origin: (3,) the source's mean: the motion is that of its frame, not of its middle.
+        planar: whether x, y and θ alone are free.
+    """
+    free = np.array(PLANE) if planar else np.arange(6)
+    has_normal = spreads[:, 0] > 0.0
+    r = np.where(has_normal, np.sum(n * e, axis=1), np.linalg.norm(e, axis=1))
+    error = float(np.sqrt(np.mean(r * r))) if len(r) else 0.0
+    p, r, spreads, n = p[has_normal], r[has_normal], spreads[has_normal], n[has_normal] @ R
+    if len(r) <= len(free):
+        nothing = np.zeros((len(free), len(free)))
+        return Certainty(nothing, np.eye(len(free)), error, "hardly any surface was met")
+    radius = max(float(np.sqrt(np.mean(np.sum(p * p, axis=1)))), 1e-12)
+    variance = max(_variance(r, len(free)), (EXACT * radius) ** 2)
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -hat(p)], axis=2)
+    across = np.einsum("ni,nij->nj", n, J)
+    along = (J - n[:, :, None] * across[:, None, :]) * np.sqrt(_tilts(spreads))[:, None, None]
+    if planar:
+        along[:, 2] = J[:, 2] = 0.0
+    across, along, J = across[:, free], along.reshape(-1, 6)[:, free], J.reshape(-1, 6)[:, free]
+    noise = along.T @ along / len(r)
+    motion = J.T @ J / len(r) + 1e-12 * np.diag(np.where(free < 3, 1.0, radius * radius))
+    L = np.linalg.cholesky(motion)
+    inverse = np.linalg.inv(L)
+    shares, axes = np.linalg.eigh(inverse @ (across.T @ across / len(r) - noise) @ inverse.T)
+    shares = np.maximum(shares, 0.0)
+    chance = np.sum((along @ inverse.T @ axes) ** 2, axis=0) / len(r)
+    is_weak = shares < LEAST_SHARE + NOISE_FACTOR * chance
+    weak = (inverse.T @ axes).T[is_weak]
+    root = L @ axes * np.sqrt(shares)
+    shift = np.eye(6)
+    shift[:3, 3:] = -hat(origin)
+    root = shift[np.ix_(free, free)].T @ root
+    information = root @ root.T * (len(r) / variance)
+    lever = np.where(free < 3, 1.0, radius)
+    return Certainty(information, weak, error, _sentence(weak * lever, planar))
+
+
+def _variance(r: Array, used: int) -> float:
+    """Return σ² of residuals (N,), a part of which may be gross."""
+    r2 = r * r
+    kept = r2[r2 <= GROSS * float(np.median(r2)) / MEDIAN_OF_CHI2]
+    return float(kept.sum() / max(len(kept) - used, 1))
+
+
+def _tilts(spreads: Array) -> Array:
+    """Return (N,) variances of normals, rad²: λ₀ λ₁ / (n (λ₁ - λ₀)²)."""
+    n, least, middle = spreads[:, 0], spreads[:, 1], spreads[:, 2]
+    return np.asarray(np.minimum(least * middle / (n * (middle - least) ** 2), 1.0))
+
+
+def _sentence(weak: Array, planar: bool) -> str:
+    """Name weak directions: along what the source may slide, about what it may turn."""
+    if not len(weak):
+        return ""
+    named = []
+    for direction in weak:
+        shift, turn = direction[: 2 if planar else 3], direction[2 if planar else 3 :]
+        if shift @ shift >= turn @ turn:
+            named.append("translation along " + _axis(shift))
+        else:
+            named.append("rotation" if planar else "rotation about " + _axis(turn))
+    return "degenerate: the clouds do not fix " + ", ".join(named)
+
+
+def _axis(vector: Array) -> str:
+    unit = vector / np.linalg.norm(vector)
+    unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
+    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in unit) + ")"

