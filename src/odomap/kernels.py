@@ -18,6 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
+from odomap.kernelfiles import keep
+
 __all__ = ["clear_cache", "kernel", "modules_with_kernels", "needed_modules", "warm_up"]
 
 _PACKAGE = Path(__file__).parent
@@ -59,10 +61,11 @@ def kernel(function: F | None = None, *, reorder: bool = False) -> F | Callable[
         import numba
 
         fastmath = {"reassoc", "contract", "nsz", "arcp"} if reorder else False
-        options: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
+        options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
         options["no_cfunc_wrapper"] = True  # nobody calls them from C
-        compiled = numba.njit(fastmath=fastmath, **options)
-        return cast(F, compiled(inner))
+        compiled = numba.njit(fastmath=fastmath, **options)(inner)
+        keep(compiled)
+        return cast(F, compiled)
 
     return compile_it if function is None else compile_it(function)
 
