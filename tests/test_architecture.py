@@ -18,6 +18,7 @@ BANNED = {"utils", "util", "common", "helpers", "helper", "base", "manager", "mi
 
 THREADS = {"threading", "queue", "multiprocessing", "_thread", "asyncio"}
 MAY_IMPORT_THREADS = {
+    "compiling.py": "a helper process that ends with its caller",
     "system/worker.py": "Ctrl-C as an event",
     "system/background.py": "runs the stages beside the tracker",
     "system/feed.py": "reads a source that does not wait",

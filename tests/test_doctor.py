@@ -58,13 +58,21 @@ def test_a_kernel_that_does_not_compile_is_found(monkeypatch):
     def fail(name):
         raise TypeError("no such type\nand a long story")
 
-    monkeypatch.setattr("odomap.kernels.modules_with_kernels", lambda: iter(["odomap.a"]))
+    name = "odomap.vision.turning"
+    monkeypatch.setattr("odomap.kernels.modules_with_kernels", lambda: [name])
     monkeypatch.setattr("odomap.kernels.warm_up", fail)
     seen = []
     finding = doctor.compile_kernels(lambda *step: seen.append(step))
     assert finding.state == "broken"
-    assert "odomap.a does not compile: TypeError: no such type" in finding.text
-    assert seen == [(0, 1, "odomap.a")]
+    assert f"{name} does not compile: TypeError: no such type" in finding.text
+    assert set(seen) == {(0, 1, name)}
+
+
+def test_a_module_that_does_not_import_is_named(monkeypatch):
+    monkeypatch.setattr("odomap.kernels.modules_with_kernels", lambda: ["odomap.a"])
+    finding = doctor.compile_kernels(lambda *step: None)
+    assert finding.state == "broken"
+    assert "odomap.a does not compile: ModuleNotFoundError: No module named" in finding.text
 
 
 @pytest.mark.parametrize("name", ["does/not/exist", "."])

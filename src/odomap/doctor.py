@@ -15,6 +15,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from odomap.machine import num_cores, total_memory_gb
 from odomap.version import __version__
 
 __all__ = [
@@ -81,21 +82,12 @@ def examine_machine() -> Iterator[Finding]:
     """Yield what odomap, the interpreter and the machine are."""
     yield Finding("odomap", "ok", f"{__version__} in {Path(__file__).parent}")
     yield Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("cores", "ok", str(cores))
+    yield Finding("cores", "ok", str(num_cores()))
     memory = total_memory_gb()
     if memory:
         small = memory < 2.0
         mend = "long recordings may need more than 2 GB" if small else ""
         yield Finding("memory", "note" if small else "ok", f"{memory:.1f} GB", mend)
-
-
-def total_memory_gb() -> float:
-    """Return the machine's memory in gigabytes, 0 where the system does not say."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    except (AttributeError, ValueError, OSError):
-        return 0.0
 
 
 def examine_core() -> Iterator[Finding]:
@@ -203,17 +195,23 @@ def compile_kernels(progress: Callable[[int, int, str], None]) -> Finding:
     Returns:
         One finding: how long it took, or which module does not compile and why.
     """
-    from odomap.kernels import modules_with_kernels, warm_up
+    from odomap.compiling import compile_modules
+    from odomap.kernels import modules_with_kernels
 
     names = list(modules_with_kernels())
+    last = ""
+
+    def tell(done: int, total: int, name: str) -> None:
+        nonlocal last
+        last = name
+        progress(done, total, name)
+
     start = time.perf_counter()
-    for index, name in enumerate(names):
-        progress(index, len(names), name)
-        try:
-            warm_up(name)
-        except Exception as error:  # whatever breaks a compilation is the finding
-            reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            mend = "clear the cache (odomap doctor --clear); if it stays, report it with this text"
-            return Finding("kernels", "broken", f"{name} does not compile: {reason}", mend)
+    try:
+        compile_modules(names, tell)
+    except Exception as error:  # whatever breaks a compilation is the finding
+        reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+        mend = "clear the cache (odomap doctor --clear); if it stays, report it with this text"
+        return Finding("kernels", "broken", f"{last} does not compile: {reason}", mend)
     seconds = time.perf_counter() - start
     return Finding("kernels", "ok", f"{len(names)} modules compiled or loaded in {seconds:.1f} s")

@@ -244,12 +244,13 @@ def _head(file: Path) -> dict[str, Any]:
 
 def _warm_up(tell: Progress) -> None:
     """Compile, or load, what fusing needs."""
-    from odomap.kernels import warm_up
+    from odomap.compiling import compile_modules
 
     names = ("maps.tsdf_depth", "maps.tsdf_kernels", "maps.surface_kernels", "views.mesh_picture")
-    for done, name in enumerate(names):
-        tell(done, len(names), f"compiling {name}")
-        warm_up(f"odomap.{name}")
+    compile_modules(
+        [f"odomap.{name}" for name in names],
+        lambda done, total, name: tell(done, total, f"compiling {name}"),
+    )
 
 
 def _views(

@@ -224,9 +224,9 @@ def _merger(rig: "Rig", config: "Config", words: "VocabularyTree | None") -> "Me
 def _warm_up(tell: Tell) -> None:
     """Compile, or load from the cache, the kernels of what compares places."""
     import odomap.system.merging  # noqa: F401 (it loads the modules whose kernels are needed)
-    from odomap.kernels import needed_modules, warm_up
+    from odomap.compiling import compile_modules
+    from odomap.kernels import needed_modules
 
-    names = needed_modules()
-    for index, name in enumerate(names):
-        tell(index, len(names), f"compiling {name}")
-        warm_up(name)
+    compile_modules(
+        needed_modules(), lambda done, total, name: tell(done, total, f"compiling {name}")
+    )

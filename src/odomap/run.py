@@ -240,13 +240,14 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
 
     By now the source is open and the system made: what it needs it has imported.
     """
-    from odomap.kernels import needed_modules, warm_up
+    from odomap.compiling import compile_modules
+    from odomap.kernels import needed_modules
 
     start = time.perf_counter()
-    names = needed_modules()
-    for index, name in enumerate(names):
-        tell(Progress("compiling", index, len(names), text=name))
-        warm_up(name)
+    compile_modules(
+        needed_modules(),
+        lambda done, total, name: tell(Progress("compiling", done, total, text=name)),
+    )
     return time.perf_counter() - start
 
 

@@ -9,9 +9,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from odomap.compiling import compile_modules
 from odomap.errors import InputError
 from odomap.files.atomic import find_obstacle, make_folder
-from odomap.kernels import modules_with_kernels, warm_up
+from odomap.kernels import modules_with_kernels
 
 __all__ = ["Tell", "check_out", "compile_imported"]
 
@@ -25,9 +26,7 @@ def compile_imported(tell: Tell) -> None:
     """Compile, or load from the cache, the kernels of all modules imported from the solvers."""
     imported = set(sys.modules)
     names = [n for n in modules_with_kernels() if n in imported and n.startswith(ROOMS)]
-    for index, name in enumerate(names):
-        tell(index, len(names), f"compiling {name}")
-        warm_up(name)
+    compile_modules(names, lambda done, total, name: tell(done, total, f"compiling {name}"))
 
 
 def check_out(given: object, *outs: str | Path | None) -> None:
