@@ -1,0 +1,191 @@
+"""Scans of the plane as points: what beams hit, the surfaces between, and how far the way is free.
+
+A scanner turns in a plane and says how far each beam went. In the body,
+
+    p_i = T_body_lidar (r_i cos φ_i, r_i sin φ_i, 0),
+
+of which the plane of the floor keeps x and y, so that a scanner may be mounted turned or head down.
+Far away beams are wide apart, and a wall would be a row of dots that the next scan's dots do not
+meet: whoever matches them is drawn to where dot lies on dot, and does not move. So neighbours are
+joined where they can be of one surface: near each other, and not seen at too flat an angle,
+
+    |p_{i+1} - p_i| < gap,    |p_{i+1} - p_i| < ratio · r Δφ,
+
+by points as close as the map's cells. Along such a surface its normal is known, from a point to
+either side of it a little away; not at corners. Where nothing came back, the way may be free.
+
+Cost: O(beams + points between).
+
+Reference: S. Kohlbrecher et al., "A flexible and scalable SLAM system with full 3D motion
+estimation", SSRR 2011 (scans in a plane of the body).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.kernels import kernel
+from odomap.limits import NotNegative, Positive, check_limits
+from odomap.sensors.rig import LidarMount
+
+__all__ = ["Beams", "ScanConfig", "ScanPoints"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """What of a scan is used."""
+
+    farthest: Positive = 20.0
+    """Ranges beyond are not used, metres."""
+    free: NotNegative = 0.0
+    """How far the way is free where nothing came back, metres; 0 says nothing of it, since glass
+    and black walls do not come back either."""
+    spacing: Positive = 0.035
+    """Distance of points on the surface between neighbouring beams, metres."""
+    gap: Positive = 0.5
+    """Distance of neighbouring points from which on they are not of one surface, metres."""
+    ratio: Positive = 10.0
+    """The same, in distances of the beams there: how flat a surface may be seen."""
+
+    baseline: Positive = 0.25
+    """How far to either side of a point a surface is looked at for its normal, metres."""
+    bend: Positive = 0.5
+    """What it may turn there, radians: more is a corner."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPoints:
+    """A scan in the plane of the body.
+
+    Attributes:
+        origin: (2,) the scanner.
+        hits: (N, 2) where beams came back from, metres.
+        normals: (N, 2) of unit length across the surfaces there, zero where there is none.
+        between: (M, 2) points on the surfaces between them.
+        free: (F, 2) how far the way is free where nothing came back.
+        num_beams: beams of the scanner.
+        num_invalid: those that said nothing: NaN.
+    """
+
+    origin: Array
+    hits: Array
+    normals: Array
+    between: Array
+    free: Array
+    num_beams: int
+    num_invalid: int
+
+    def __len__(self) -> int:
+        return len(self.hits)
+
+
+class Beams:
+    """The directions of a scanner's beams, on the body.
+
+    Args:
+        mount: of a 2D scanner.
+        config: what is used.
+    """
+
+    def __init__(self, mount: LidarMount, config: ScanConfig | None = None) -> None:
+        self.config = ScanConfig() if config is None else config
+        first, last, count = mount.angles
+        angles = np.linspace(first, last, count)
+        T = mount.T_body_lidar.matrix
+        directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+        self._directions = np.ascontiguousarray((directions @ T[:3, :3].T)[:, :2])
+        self._origin = np.array(T[:2, 3])
+        self._step = abs(last - first) / max(count - 1, 1)
+        self._near, far = mount.range_m
+        self._far = min(far, self.config.farthest)
+
+    def __len__(self) -> int:
+        return len(self._directions)
+
+    def points(self, ranges: Array) -> ScanPoints:
+        """Return a scan as points.
+
+        Args:
+            ranges: (beams,) metres, NaN where invalid, inf where nothing came back.
+
+        Raises:
+            ValueError: it has another number of beams.
+        """
+        if ranges.shape != (len(self),):
+            raise ValueError(f"a scan of {len(ranges)} beams, expected {len(self)}")
+        is_hit = (ranges >= self._near) & (ranges <= self._far)
+        p = self._origin + self._directions * np.where(is_hit, ranges, 0.0)[:, None]
+        nothing = np.isposinf(ranges) | (ranges > self._far)
+        reach = min(self.config.free, self._far)
+        ends = self._origin + reach * self._directions[nothing] if reach else np.zeros((0, 2))
+        is_one = self._is_one_surface(p, ranges, is_hit)
+        normals = np.zeros_like(p)
+        find_normals(p, is_hit, is_one, self.config.baseline, np.cos(self.config.bend), normals)
+        return ScanPoints(
+            origin=self._origin,
+            hits=p[is_hit],
+            normals=normals[is_hit],
+            between=_between(p, is_one, self.config.spacing),
+            free=ends,
+            num_beams=len(ranges),
+            num_invalid=int(np.isnan(ranges).sum()),
+        )
+
+    def _is_one_surface(self, p: Array, ranges: Array, is_hit: Mask) -> Mask:
+        """Say of each beam but the last whether it and the next may be of one surface."""
+        config = self.config
+        step = np.linalg.norm(p[1:] - p[:-1], axis=1)
+        nearer = np.where(is_hit[1:] & is_hit[:-1], np.minimum(ranges[1:], ranges[:-1]), 0.0)
+        return np.asarray((step < config.gap) & (step < config.ratio * nearer * self._step))
+
+
+def _between(p: Array, is_one: Mask, spacing: float) -> Array:
+    """Return points on the surfaces between neighbours, (M, 2)."""
+    step = np.linalg.norm(p[1:] - p[:-1], axis=1)
+    parts = np.where(is_one, np.ceil(step / spacing), 1.0).astype(np.int64) - 1
+    i = np.repeat(np.arange(len(parts)), parts)
+    n = np.arange(len(i)) - np.repeat(np.cumsum(parts) - parts, parts) + 1.0
+    share = (n / (parts[i] + 1.0))[:, None]
+    return np.asarray((1.0 - share) * p[i] + share * p[i + 1])
+
+
+@kernel
+def find_normals(
+    p: Array, is_hit: Mask, is_one: Mask, baseline: float, straight: float, normals: Array
+) -> None:
+    """n ⊥ p_r - p_l, the first points of the surface at least a baseline to either side of p_i,
+    where the ways to both are straight: cos of the angle between them. Beams too wide apart to
+    be of one surface still are of one line where they are straight."""
+    for i in range(1, len(p) - 1):
+        left, right = i, i
+        while left > 0 and is_one[left - 1]:
+            left -= 1
+            if np.hypot(p[left, 0] - p[i, 0], p[left, 1] - p[i, 1]) >= baseline:
+                break
+        while right < len(p) - 1 and is_one[right]:
+            right += 1
+            if np.hypot(p[right, 0] - p[i, 0], p[right, 1] - p[i, 1]) >= baseline:
+                break
+        left -= left == i and is_hit[i - 1]
+        right += right == i and is_hit[i + 1]
+        a_x, a_y = p[i, 0] - p[left, 0], p[i, 1] - p[left, 1]
+        b_x, b_y = p[right, 0] - p[i, 0], p[right, 1] - p[i, 1]
+        a, b = np.hypot(a_x, a_y), np.hypot(b_x, b_y)
+        least = 0.3 * baseline
+        if not is_hit[i] or a < least or b < least or a_x * b_x + a_y * b_y < straight * a * b:
+            continue
+        x, y = a_x + b_x, a_y + b_y
+        length = np.hypot(x, y)
+        normals[i, 0], normals[i, 1] = -y / length, x / length
+
+
+def warm_up() -> None:
+    """Compile the kernels of this module."""
+    Beams(LidarMount("laser", angles=(-0.1, 0.1, 3))).points(np.ones(3))
