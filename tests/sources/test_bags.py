@@ -193,6 +193,25 @@ def test_a_damaged_database(tmp_path: Path) -> None:
     assert "has no index that can be used" in " ".join(source.notes)  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_bags_with_wrong_bytes_never_crash(tmp_path: Path, kind: str) -> None:
+    path = write_bag(tmp_path / ("a.bag" if "ros1" in kind else "a"), kind)
+    file = next(path.glob("a.*")) if path.is_dir() else path
+    data = file.read_bytes()
+    rng = np.random.default_rng(5)
+    read = 0
+    for _ in range(25):
+        broken = bytearray(data)
+        for at in rng.integers(len(data), size=3).tolist():
+            broken[at] = int(rng.integers(256))
+        file.write_bytes(broken[: int(rng.uniform(0.2, 1.5) * len(data))])
+        try:
+            read += len(list(open_source(path)))
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+    assert read > 0
+
+
 def test_what_is_no_bag_says_so(tmp_path: Path) -> None:
     cases: dict[str, bytes] = {
         "empty.bag": b"",

@@ -239,9 +239,14 @@ def test_what_is_no_log_says_so(write: Write, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=words):
             open_source(write(text))
     assert len(open_source(f"{write(flaser(0, [1.0] * 4, kind='RLASER'))}?scan=RLASER")) == 1
-    for name, data in (("empty.clf", b""), ("noise.log.bz2", b"BZh9 no"), ("b.clf", b"\0" * 5000)):
+    for name, data, words in (
+        ("empty.clf", b"", r"is no laser log: no line begins with FLASER \(found nothing\)"),
+        ("b.clf", b"\0" * 5000, "is no laser log"),
+        ("noise.log.bz2", b"BZh9 no", "cannot be unpacked to its end"),
+        ("noise.log.gz", b"\x1f\x8b no", "cannot be unpacked to its end"),
+    ):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match="is no laser log"):
+        with pytest.raises(InputError, match=words):
             open_source(tmp_path / name)
     path = write(flaser(0, [1.0] * 4))
     for query, words in (

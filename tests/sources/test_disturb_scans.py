@@ -38,6 +38,7 @@ def test_the_name_of_a_world(hall: SimulatedSource) -> None:
     assert facts["lidars"][0]["beams"] == 181
     assert facts["truth"]["poses"] == 12
     assert facts["rate_hz"] == 10.0
+    assert facts["scans"]["odometry_path_m"] == pytest.approx(facts["truth"]["path_m"], rel=0.1)
     assert source.rig.body_sensor == ""
     for frame in source:
         assert frame.images == ()

@@ -143,14 +143,15 @@ def _lidar(lidar: dict[str, Any]) -> str:
 
 
 def _scans(scans: dict[str, Any]) -> list[tuple[str, str]]:
-    code = scans["no_return_m"]
-    lost = f"{scans['share_no_return']:.2%} of the beams"
+    rows = []
+    if "share_invalid" in scans:
+        code = scans["no_return_m"]
+        lost = f"{scans['share_no_return']:.2%} of the beams"
+        rows.append(("no return", lost if code is None else f"{lost}, written as {code:g} m"))
+        rows.append(("invalid", f"{scans['share_invalid']:.2%} of the beams"))
     path = scans["odometry_path_m"]
-    return [
-        ("no return", lost if code is None else f"{lost}, written as {code:g} m"),
-        ("invalid", f"{scans['share_invalid']:.2%} of the beams"),
-        ("odometry", "none" if path is None else f"of the wheels, {path:.2f} m"),
-    ]
+    rows.append(("odometry", "none" if path is None else f"of the wheels, {path:.2f} m"))
+    return rows
 
 
 def _truth(facts: dict[str, Any]) -> str:

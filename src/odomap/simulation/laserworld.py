@@ -1,9 +1,9 @@
 """Worlds for a 2D laser on wheels: a plan, a way through it, scans and odometry, no images.
 
 A robot drives a closed way in a floor plan, in its plane, and takes a scan at each frame; people
-walk the same way. Nothing is rendered, so a scan costs a third of a millisecond and a world of two
-rounds of a building is there at once. As everywhere, the seed decides it to the last byte, and
-frames are made when they are asked for, in any order.
+walk the same way. Nothing is rendered, so a scan costs a millisecond or two, and a world of ten
+rounds of a building is there within a second. As everywhere, the seed decides it to the last byte,
+and frames are made when they are asked for, in any order.
 
 Ranges are wrong as those of the other laser (`lidar`): noise that grows with range, lost beams,
 beams on an edge that return something between. The body is the middle of the wheels, the laser

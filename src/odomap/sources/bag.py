@@ -277,11 +277,13 @@ class BagSource:
 
     def _frame(self, index: int, ranges: NDArray[np.float32]) -> Frame:
         mark(ranges, self._kind.nearest, self._kind.farthest)
+        with np.errstate(invalid="ignore"):  # some NaN of a damaged file signal when they are cast
+            scan = ranges.astype(np.float64)
         T = None if self.odometry is None else self.odometry[index]
         return Frame(
             id=index,
             stamp_ns=int(self.stamps_ns[index]),
-            scan=ranges.astype(np.float64),
+            scan=scan,
             odometry=None if T is None or np.isnan(T[0, 0]) else T,
         )
 

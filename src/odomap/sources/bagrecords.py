@@ -29,8 +29,8 @@ __all__ = ["MCAP_MAGIC", "ROS1_MAGIC", "SQLITE_MAGIC", "Cut", "Record", "records
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
-LARGEST = 1 << 31
-"""Bytes of a record; a longer one is none."""
+LARGE = 1 << 20
+"""Bytes from which on a record is looked for in the file before it is read."""
 
 Unpack = Callable[[bytes], bytes]
 
@@ -91,8 +91,11 @@ def _as_is(data: bytes) -> bytes:
 
 
 def _exactly(file: BinaryIO, count: int) -> bytes:
-    if count > LARGEST:
-        raise Cut(f"a record of {count} bytes cannot be")
+    if count > LARGE:  # before so much memory is asked for
+        here = file.tell()
+        if count > file.seek(0, 2) - here:
+            raise Cut("ends within a record")
+        file.seek(here)
     data = file.read(count)
     if len(data) != count:
         raise Cut("ends within a record")
@@ -183,8 +186,8 @@ def _sqlite(path: Path) -> Iterator[Record]:
                 if topic in topics:
                     name, kind, encoding = topics[topic]
                     yield Record(name, kind, encoding, int(time_ns), bytes(data))
-    except sqlite3.Error as error:
-        raise Cut(str(error)) from error
+    except (sqlite3.Error, TypeError, ValueError) as error:
+        raise Cut(" ".join(str(error).split())) from error
 
 
 def _text(file: BinaryIO) -> str:
@@ -196,5 +199,6 @@ def _unpacked(unpack: dict[str, Unpack], name: str, data: bytes) -> bytes:
         raise Cut(f"a chunk is packed by '{name}', which is not known")
     try:
         return unpack[name](data)
-    except (OSError, EOFError, ValueError, RuntimeError) as error:
+    # Each library that unpacks has errors of its own.
+    except Exception as error:
         raise Cut(f"a chunk cannot be unpacked ({error})") from error

@@ -109,20 +109,20 @@ def _lidar(mount: LidarMount) -> dict[str, Any]:
 def _scans(source: Source) -> dict[str, Any] | None:
     """Return what became of the beams of a recording, and how far its wheels went."""
     beams: Beams | None = getattr(source, "beams", None)
-    if beams is None:
-        return None
     odometry: NDArray[np.float64] | None = getattr(source, "odometry", None)
-    path = None
+    if beams is None and odometry is None:
+        return None
+    facts: dict[str, Any] = {"odometry_path_m": None}
     if odometry is not None:
         steps = np.diff(odometry[:, :3, 3], axis=0)
-        path = round(float(np.linalg.norm(steps, axis=1).sum()), 3)
-    value = beams.no_return_m
-    return {
-        "no_return_m": round(value, 4) if np.isfinite(value) else None,
-        "share_no_return": round(beams.share_no_return, 5),
-        "share_invalid": round(beams.share_invalid, 5),
-        "odometry_path_m": path,
-    }
+        # Where the wheels say nothing there is no step.
+        facts["odometry_path_m"] = round(float(np.nansum(np.linalg.norm(steps, axis=1))), 3)
+    if beams is not None:
+        value = beams.no_return_m
+        facts["no_return_m"] = round(value, 4) if np.isfinite(value) else None
+        facts["share_no_return"] = round(beams.share_no_return, 5)
+        facts["share_invalid"] = round(beams.share_invalid, 5)
+    return facts
 
 
 def _depth(source: Source) -> dict[str, Any] | None:

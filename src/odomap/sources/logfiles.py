@@ -71,13 +71,16 @@ def beginnings(path: Path) -> list[str]:
     """Return the first words of the first lines of a file, none if it is not text.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: it cannot be read, or nothing of it can be unpacked.
     """
-    words = []
-    for number, line in LogLines(path):
+    words: list[str] = []
+    lines = LogLines(path)
+    for number, line in lines:
         if number > PEEKED_LINES:
             break
         words += line.split(maxsplit=1)[:1]
+    if lines.cut and not words:
+        raise InputError(f"{path}: {lines.cut}")
     return words
 
 

@@ -51,7 +51,8 @@ def open(path: str | Path, rig: Rig | str | Path | None = None) -> Source:
     """Open a recording, a live camera or a simulated world; the format is recognised.
 
     Args:
-        path: a folder, a video, a `world.yaml`, or a name that begins with "sim:" or "camera:".
+        path: a folder, a video, a log, a bag, a `world.yaml`, or a name that begins with "sim:" or
+            "camera:".
         rig: calibration to use instead of the recording's own: a rig, or a `rig.yaml`. Without
             it, a `rig.yaml` in the folder is used where the recording has no calibration.
 

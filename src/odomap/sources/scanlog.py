@@ -25,6 +25,8 @@ __all__ = ["Table", "half_plane", "log_of", "mounted", "rate_of"]
 
 HALF_PLANE = (180, 181, 360, 361, 720, 721)
 """Usual numbers of beams over 180 degrees."""
+FARTHEST_M = 1e9
+"""Farther from its origin no robot is."""
 NOMINAL_S = 0.1
 """How far apart scans without stamps are taken to be."""
 
@@ -63,8 +65,8 @@ class Table:
         tail: tuple[str, ...] = (), angles: tuple[float, ...] = (),
     ) -> None:  # fmt: skip
         """Add a row; one whose poses are not numbers is left out."""
-        if not np.isfinite(poses).all():
-            self.skip(number, "its pose is not finite")
+        if not np.all(np.abs(poses) < FARTHEST_M):
+            self.skip(number, "its pose is not finite, or farther away than any can be")
             return
         self.numbers.append(number)
         with np.errstate(over="ignore"):

@@ -29,6 +29,8 @@ Pair = tuple[str, str]
 
 SAME = 1e-6
 """Two transforms that differ by less are one (metres, and elements of rotations)."""
+FARTHEST_M = 1e9
+"""Farther from its origin no robot is."""
 ODOM = "odom"
 """The frame in which wheels count, by REP-105."""
 
@@ -42,8 +44,11 @@ def pose_of(t: Any, q: Any) -> Array | None:
     """Return (4, 4) of a translation and a quaternion of ROS, None if they are no pose."""
     quaternion = np.array([q.w, q.x, q.y, q.z], np.float64)
     place = np.array([t.x, t.y, t.z], np.float64)
+    # Bytes that were damaged give numbers too large to be squared.
+    if not (np.all(np.abs(quaternion) < 2) and np.all(np.abs(place) < FARTHEST_M)):
+        return None
     length = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(place).all() and abs(length - 1) < 0.1):
+    if abs(length - 1) >= 0.1:
         return None
     T = np.eye(4)
     T[:3, :3] = rotation_from_quaternion(quaternion / length)
