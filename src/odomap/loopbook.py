@@ -96,4 +96,5 @@ class LoopBook:
             rescaled=loop.rescaled,
             T_matched_keyframe=loop.T_matched_keyframe,
             doubts=loop.doubts,
+            is_tied=loop.is_tied,
         )

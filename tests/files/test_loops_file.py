@@ -163,3 +163,18 @@ def test_a_large_file_is_not_even_read(tmp_path: Path) -> None:
         file.truncate(1 << 40)
     with pytest.raises(InputError, match="no list of loops"):
         read_loops(tmp_path / "loops.json")
+
+
+def test_a_loop_says_if_tracking_had_found_the_place_itself(tmp_path: Path) -> None:
+    file, tied = tmp_path / "loops.json", replace(CLOSED, is_tied=True)
+    log = LoopLog("x", True, 0, (CLOSED, tied))
+    write_loops(file, log)
+    again = read_loops(file)
+    assert [record.is_tied for record in again.records] == [False, True]
+    assert again.remarks(again.records[0]) == ()
+    assert again.remarks(again.records[1]) == ("tracking had found the old map again",)
+    content = json.loads(file.read_text("utf-8"))
+    for candidate in content["candidates"]:
+        del candidate["is_tied"]  # as older files have it
+    file.write_text(json.dumps(content), "utf-8")
+    assert [record.is_tied for record in read_loops(file).records] == [False, False]

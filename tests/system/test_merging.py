@@ -13,8 +13,8 @@ from odomap.maps.estimate import Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.simulation.world import World
-from odomap.system.closing import LoopCloser, SideVerifier, strayed
-from odomap.system.closure import Tie, edges_of, read_essentials
+from odomap.system.closing import LoopCloser, SideVerifier
+from odomap.system.closure import Tie, edges_of, read_essentials, strayed
 from odomap.system.config import preset
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch

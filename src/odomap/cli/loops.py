@@ -101,7 +101,7 @@ def _row(loops: "LoopLog", record: "LoopRecord") -> list[str]:
     before = _when(loops, record.matched_frame, record.matched_stamp_ns, record.matched_id)
     decided = "rejected" if record.reason else "merged" if record.merges else "closed"
     moved = moved_text(record, loops.is_metric) if record.is_accepted else "-"
-    said = "; ".join(loops.doubts(record)) if record.is_accepted else record.reason
+    said = "; ".join(loops.remarks(record)) if record.is_accepted else record.reason
     return [decided, back, before, f"{record.num_inliers:7d}", moved, said]
 
 

@@ -67,6 +67,7 @@ class LoopRecord:
             the identity where none was found.
         doubts: loops closed before that contradict it and are not believed any more, each by the
             keyframe that came back and the one it came back to.
+        is_tied: whether landmarks of the old map pointed at it, which tracking had found again.
     """
 
     keyframe_id: int
@@ -84,6 +85,7 @@ class LoopRecord:
     rescaled: float
     T_matched_keyframe: NDArray[np.float64]
     doubts: tuple[tuple[int, int], ...] = ()
+    is_tied: bool = False
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -117,8 +119,8 @@ class LoopLog:
         """Those that were not."""
         return tuple(record for record in self.records if not record.is_accepted)
 
-    def doubts(self, record: LoopRecord) -> tuple[str, ...]:
-        """Say in words which earlier loops a loop contradicts, and which later ones contradict it.
+    def remarks(self, record: LoopRecord) -> tuple[str, ...]:
+        """Say in words how a loop was found if not by its look, and what contradicts it.
 
         Args:
             record: one that was closed.
@@ -128,6 +130,7 @@ class LoopLog:
         before = [ends for ends in record.doubts if ends not in closed]
         later = [other for other in self.closed if record.ends in other.doubts]
         said = [
+            "tracking had found the old map again" if record.is_tied else "",
             f"contradicts the one at {self._at(earlier)}" if earlier else "",
             f"contradicts {_of_the_map_before(before)}" if before else "",
             f"not believed any more: contradicts that at {self._at(later)}" if later else "",
@@ -230,6 +233,7 @@ def _record(at: "_Checked") -> LoopRecord:
         rescaled=at.number("rescaled", 0.0),
         T_matched_keyframe=at.pose("T_matched_keyframe"),
         doubts=at.pairs("doubts"),
+        is_tied=at.truth("is_tied", False),
     )
     if record.is_accepted == bool(record.reason):
         raise at.error("reason", "must be there for a candidate that is refused, and only there")
@@ -263,9 +267,9 @@ class _Checked:
             raise self.error(name, f"must be a finite number >= {least:g}")
         return float(value)
 
-    def truth(self, name: str) -> bool:
-        """Return true or false."""
-        value = self._content.get(name)
+    def truth(self, name: str, default: bool | None = None) -> bool:
+        """Return true or false, or the default where the file is older than the field."""
+        value = self._content.get(name, default)
         if type(value) is not bool:
             raise self.error(name, "must be true or false")
         return value

@@ -23,7 +23,7 @@ T-RO 2015, section VII.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.graphs.graphproblem import import_group
 from odomap.geometry.camera import Camera
-from odomap.geometry.lie import se3_inverse, se3_log, so3_log
+from odomap.geometry.lie import so3_log
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.closure import (
@@ -43,12 +43,13 @@ from odomap.system.closure import (
     edges_of,
     pieces_of,
     read_essentials,
+    strayed,
 )
 from odomap.system.covisibility import Acquaintance
 from odomap.system.essentialgraph import Corrected, Essentials, correct
 from odomap.system.loopsearch import ClosingConfig, LoopSearch, News
 from odomap.system.loopsides import LoopSide, read_side
-from odomap.system.path import ASTRAY
+from odomap.system.rejoining import Rejoining, Unbent
 from odomap.system.revisits import Revisit
 from odomap.system.stages import Loop
 from odomap.system.verifying import Verified, VerifyConfig, verify
@@ -60,7 +61,6 @@ __all__ = [
     "LoopCloser",
     "SideVerifier",
     "Verifier",
-    "strayed",
 ]
 
 Array = NDArray[np.float64]
@@ -70,8 +70,8 @@ Index = NDArray[np.int64]
 class Verifier(Protocol):
     """Decides by geometry whether two keyframes show one place."""
 
-    def read(self, map: Map, keyframe_id: int) -> LoopSide:
-        """Read what a keyframe and those around it show."""
+    def read(self, map: Map, keyframe_id: int, part: Collection[int] | None = None) -> LoopSide:
+        """Read what a keyframe and those around it show, of a part of the map."""
         ...
 
     def verify(self, newer: LoopSide, matched: LoopSide, seed: int) -> Verified:
@@ -101,9 +101,9 @@ class SideVerifier:
     matching: MatchConfig
     config: VerifyConfig = field(default_factory=VerifyConfig)
 
-    def read(self, map: Map, keyframe_id: int) -> LoopSide:
-        """Read what a keyframe and those around it show."""
-        return read_side(map, keyframe_id, self.camera, self.T_body_camera)
+    def read(self, map: Map, keyframe_id: int, part: Collection[int] | None = None) -> LoopSide:
+        """Read what a keyframe and those around it show, of a part of the map."""
+        return read_side(map, keyframe_id, self.camera, self.T_body_camera, part=part)
 
     def verify(self, newer: LoopSide, matched: LoopSide, seed: int) -> Verified:
         """Decide, and measure how the two lie to each other."""
@@ -127,6 +127,11 @@ class _Candidate:
     newer: LoopSide
     matched: LoopSide
     stamps_ns: tuple[int, int]
+    unbent: Unbent | None = None
+
+    def path(self, essentials: Essentials) -> Essentials:
+        """Return the path to be corrected: as odometry told it before landmarks tied the two."""
+        return essentials if self.unbent is None else self.unbent.of(essentials)
 
 
 class LoopCloser:
@@ -155,6 +160,7 @@ class LoopCloser:
         self._asked: list[Revisit] = []
         self._since_closed: int = config.rest
         self._waiting: Tie | None = None
+        self._rejoining = Rejoining(search.known)
         import_group("Sim3" if with_scale else "SE3")
         search.index(search.follow(map))
 
@@ -174,6 +180,8 @@ class LoopCloser:
         news = self.search.follow(self._map, None if keyframe is None else keyframe.id)
         asked, self._asked = self._asked, []
         candidates = self._read(asked)
+        if keyframe is not None:
+            candidates = (*self._read_rejoined(keyframe.id), *candidates)
         path = read_essentials(self._map, self.search.known) if candidates else None
         return ClosingJob(self, keyframe, news, candidates, path)
 
@@ -189,6 +197,16 @@ class LoopCloser:
         return tuple(
             _Candidate(newer, read(self._map, k), (stamp_ns, at(k).stamp_ns)) for k in left
         )
+
+    def _read_rejoined(self, keyframe_id: int) -> tuple[_Candidate, ...]:
+        """Read both sides of what landmarks tie a keyframe to, far along all that was measured."""
+        tie = self._rejoining.follow(self._map, keyframe_id)
+        if tie is None or self._since_closed < self._config.rest:
+            return ()
+        ends = (tie.keyframe_id, tie.here), (tie.matched_id, tie.there)
+        newer, matched = (self.verifier.read(self._map, k, part) for k, part in ends)
+        stamps_ns = tuple(self._map.keyframe(k).stamp_ns for k, _ in ends)
+        return (_Candidate(newer, matched, (stamps_ns[0], stamps_ns[1]), tie.unbent),)
 
     # ---- without the map ----
 
@@ -209,11 +227,13 @@ class LoopCloser:
             found = self.verifier.verify(newer, matched, newer.keyframe_id)
             ends = newer.keyframe_id, matched.keyframe_id
             loop = Loop(*ends, found.T_matched_keyframe, found.num_inliers, False, found.reason)
-            loop = replace(loop, stamps_ns=candidate.stamps_ns)
+            is_tied = candidate.unbent is not None
+            loop = replace(loop, stamps_ns=candidate.stamps_ns, is_tied=is_tied)
             if found.is_accepted:
                 tie = Tie(*ends, found)
-                corrected = correct(essentials, edges_of(essentials, (tie,)), self._with_scale)
-                same, reason = self._confirming(essentials, tie, corrected)
+                path = candidate.path(essentials)
+                corrected = correct(path, edges_of(path, (tie,)), self._with_scale)
+                same, reason = self._confirming(path, tie, corrected)
                 if not reason:
                     loops.append(_closed(loop, essentials, corrected))
                     return loops, Closure((tie,), essentials, corrected, same)
@@ -340,38 +360,15 @@ def _closed(loop: Loop, before: Essentials, after: Corrected) -> Loop:
     )
 
 
-def strayed(
-    keyframe_id: int, matched_id: int, before: Essentials, after: Corrected, with_scale: bool
-) -> str:
-    """Say if a merge moves a piece further than its covariance allows, which grew in the gap.
-
-    A single camera's pieces differ in scale, so that only how it turned is held against it. Where
-    nothing is known of the covariance, as of a map that was taken in, nothing is.
-    """
-    rows = np.searchsorted(before.keyframe_ids, (keyframe_id, matched_id))
-    Ts, Ts_new = before.Ts_world_body[rows], after.Ts_world_body[rows]
-    moved = se3_log(se3_inverse(Ts) @ Ts_new)
-    k = int(np.argmax(np.linalg.norm(moved, axis=1)))  # the end in the piece that is moved
-    used = slice(3, 6) if with_scale else slice(0, 6)
-    xi, covariance = moved[k, used], before.covariances[rows[k]][used, used]
-    if not np.isfinite(covariance).all():
-        return ""
-    if xi @ np.linalg.pinv(covariance, hermitian=True) @ xi <= ASTRAY**2:
-        return ""
-    metres, degrees = np.linalg.norm(moved[k, :3]), np.degrees(np.linalg.norm(moved[k, 3:]))
-    where = (
-        f"{degrees:.0f}° turned" if with_scale else f"{metres:.2g} away and {degrees:.0f}° turned"
-    )
-    return f"joins two pieces of the map, but {where}: further than the camera can have come unseen"
-
-
 def _log(loops: list[Loop]) -> None:
     for loop in loops:
         ends = loop.keyframe_id, loop.matched_id
         if loop.is_accepted:
-            text = "keyframe %d is back at %d: %d inliers, moved by %.3g%s"
+            text = "keyframe %d is back at %d: %d inliers, moved by %.3g%s%s"
             merged = ", two pieces are one" if loop.merges else ""
-            logging.getLogger(__name__).info(text, *ends, loop.num_inliers, loop.moved, merged)
+            tied = ", where tracking had found the old map again" if loop.is_tied else ""
+            said = *ends, loop.num_inliers, loop.moved, merged, tied
+            logging.getLogger(__name__).info(text, *said)
             for doubted in loop.doubts:
                 text = "keyframe %d is not believed to be back at %d any more: that contradicts %d"
                 logging.getLogger(__name__).warning(text, *doubted, loop.keyframe_id)

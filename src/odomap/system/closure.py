@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.graphs.components import connected_components
-from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.geometry.lie import se3_adjoint, se3_inverse, se3_log
 from odomap.maps.atlas import beginnings
 from odomap.maps.edges import LOOP
 from odomap.maps.map import Map
@@ -35,6 +35,7 @@ from odomap.maps.states import compose, inverse, stretched
 from odomap.system.correction import correction
 from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
 from odomap.system.essentialgraph import Corrected, Essentials, LoopEdges
+from odomap.system.path import ASTRAY
 from odomap.system.verifying import Verified
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "edges_of",
     "pieces_of",
     "read_essentials",
+    "strayed",
 ]
 
 Array = NDArray[np.float64]
@@ -171,6 +173,31 @@ def pieces_of(essentials: Essentials, ties: Sequence[Tie]) -> list[frozenset[int
     second = np.concatenate([np.flatnonzero(child), loops.j])
     label, new = connected_components(len(ids), first, second), edges_of(essentials, ties)
     return [frozenset(ends) for ends in zip(label[new.i].tolist(), label[new.j].tolist())]
+
+
+def strayed(
+    keyframe_id: int, matched_id: int, before: Essentials, after: Corrected, with_scale: bool
+) -> str:
+    """Say if a merge moves a piece further than its covariance allows, which grew in the gap.
+
+    A single camera's pieces differ in scale, so that only how it turned is held against it. Where
+    nothing is known of the covariance, as of a map that was taken in, nothing is.
+    """
+    rows = np.searchsorted(before.keyframe_ids, (keyframe_id, matched_id))
+    Ts, Ts_new = before.Ts_world_body[rows], after.Ts_world_body[rows]
+    moved = se3_log(se3_inverse(Ts) @ Ts_new)
+    k = int(np.argmax(np.linalg.norm(moved, axis=1)))  # the end in the piece that is moved
+    used = slice(3, 6) if with_scale else slice(0, 6)
+    xi, covariance = moved[k, used], before.covariances[rows[k]][used, used]
+    if not np.isfinite(covariance).all():
+        return ""
+    if xi @ np.linalg.pinv(covariance, hermitian=True) @ xi <= ASTRAY**2:
+        return ""
+    metres, degrees = np.linalg.norm(moved[k, :3]), np.degrees(np.linalg.norm(moved[k, 3:]))
+    where = (
+        f"{degrees:.0f}° turned" if with_scale else f"{metres:.2g} away and {degrees:.0f}° turned"
+    )
+    return f"joins two pieces of the map, but {where}: further than the camera can have come unseen"
 
 
 @dataclass(frozen=True, eq=False)

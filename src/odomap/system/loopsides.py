@@ -15,6 +15,7 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, section VII; Mur-Artal, Tardós, "ORB-SLAM2", T-RO 2017, section III-C.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -133,7 +134,12 @@ class LoopSide:
 
 
 def read_side(
-    map: Map, keyframe_id: int, camera: Camera, T_body_camera: Array, group: int = GROUP
+    map: Map,
+    keyframe_id: int,
+    camera: Camera,
+    T_body_camera: Array,
+    group: int = GROUP,
+    part: Collection[int] | None = None,
 ) -> LoopSide:
     """Copy what a keyframe and its covisible group show.
 
@@ -143,6 +149,8 @@ def read_side(
         camera: the ideal pinhole that the features are in.
         T_body_camera: (4, 4) its mount.
         group: covisible keyframes whose landmarks are read too, at most.
+        part: keyframes that may be of the group, and those whose landmarks count: what others made
+            is left out. Default: all.
 
     Raises:
         InputError: the keyframe has no features, or none with descriptors of 32 bytes.
@@ -153,8 +161,14 @@ def read_side(
         if features is None or features.descriptors.shape[1:] != (32,):
             raise InputError(f"keyframe {keyframe_id}: has no features with binary descriptors")
         own_ids, rows = map.observations_of(keyframe_id)
-        around = map.covisible(keyframe_id)[0][:group]
-        ids = np.union1d(own_ids, map.landmarks_of(around))
+        around, ids = map.covisible(keyframe_id)[0], own_ids
+        if part is not None:
+            around = around[_are_in(around, part)]
+        ids = np.union1d(own_ids, map.landmarks_of(around[:group]))
+        if part is not None:
+            ids = ids[_are_in(map.anchors(ids), part)]
+            kept = np.isin(own_ids, ids)
+            own_ids, rows = own_ids[kept], rows[kept]
         T_world_body, scale = map.T_world_body(keyframe_id), map.scale(keyframe_id)
         views = map.views_of(ids, T_body_camera)
     is_own = np.isin(views.ids, own_ids)
@@ -188,3 +202,7 @@ def read_side(
         distances=views.distance[order],
         landmark_levels=views.level[order],
     )
+
+
+def _are_in(ids: Index, part: Collection[int]) -> NDArray[np.bool_]:
+    return np.isin(ids, np.fromiter(part, np.int64, len(part)))

@@ -66,6 +66,8 @@ class Loop:
             nobody noted them.
         doubts: loops closed before that contradict it and are not believed any more, by keyframe
             that came back and keyframe it came back to.
+        is_tied: whether landmarks of the old map pointed at it, which tracking had found again;
+            else it was how the place looks.
     """
 
     keyframe_id: int
@@ -80,6 +82,7 @@ class Loop:
     rescaled: float = 1.0
     stamps_ns: tuple[int, int] | None = None
     doubts: tuple[tuple[int, int], ...] = ()
+    is_tied: bool = False
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def _closed(log: LoopLog, scale: float, unit: str) -> str:
     rows = []
     for n, loop in enumerate(log.closed[:MOST], 1):
         merged = ["two pieces of the map became one"] if loop.merges else []
-        said = "; ".join([*merged, *log.doubts(loop)])
+        said = "; ".join([*merged, *log.remarks(loop)])
         moved = _length(scale * loop.moved, unit), f"{math.degrees(loop.turned):.2g}°"
         rescaled = [] if log.is_metric else [f"{100.0 * (loop.rescaled - 1.0):+.1f} %"]
         cells = [f"{loop.num_inliers:,}", *moved, *rescaled, said]
