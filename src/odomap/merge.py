@@ -121,6 +121,8 @@ def merge_maps(
     found = merger.merge(a.map, b.map, tell)
     if found.reason:
         raise TrackingFailed(f"{b.name}: has no place in common with {a.name}: {_why(found)}")
+    if sensors != "mono":
+        _adjust(found.map, rig, config, tell)
     merged = Merged(
         found.map,
         rig,
@@ -221,9 +223,38 @@ def _merger(rig: "Rig", config: "Config", words: "VocabularyTree | None") -> "Me
     return Merger(words, verifier, with_scale, config.closing)
 
 
+def _adjust(map: "Map", rig: "Rig", config: "Config", tell: Tell) -> None:
+    """Bring the whole map into agreement with all that was seen, where depth was measured.
+
+    Of one camera's maps one came out better and one worse: they stay as loops have left them.
+    """
+    from odomap.system.globaladjustment import GlobalAdjuster
+    from odomap.system.visual import Sight
+
+    sight = Sight.of(rig, config)
+    if not config.adjusting.enabled or sight.ranger is None:
+        return
+    tell(0, 0, "adjusting")
+    job = GlobalAdjuster(
+        map,
+        sight.eye.camera,
+        sight.eye.T_body_camera,
+        config.noise.feature_px,
+        config.orb.scale,
+        sight.ranger.sigma,
+        sight.depth_bias(config.noise),
+        config.mapping.gate,
+        config.bundle,
+        config.adjusting,
+    ).whole()
+    job.read()
+    job.solve().write(map)
+
+
 def _warm_up(tell: Tell) -> None:
     """Compile, or load from the cache, the kernels of what compares places."""
-    import odomap.system.merging  # noqa: F401 (it loads the modules whose kernels are needed)
+    import odomap.system.globaladjustment  # (these load the modules whose kernels are needed)
+    import odomap.system.merging  # noqa: F401
     from odomap.compiling import compile_modules
     from odomap.kernels import needed_modules
 

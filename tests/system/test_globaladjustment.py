@@ -65,6 +65,25 @@ def test_what_all_depths_are_off_by_is_taken_away():
     assert errors[1] < 0.03
 
 
+@pytest.mark.parametrize("bias", [0.0, 0.02])
+def test_a_map_that_others_made_tells_its_bias(bias):
+    """Made as mapping makes it: landmarks lie where depths say, less the bias."""
+    w = adjust_world(seed=3, bias=bias)
+    adjuster = adjuster_of(w)
+    adjust(w, bias=bias)
+    job = adjuster.whole()
+    job.read()
+    before = w.ate()
+    change = job.solve()
+    found, _ = adjuster.problem(w.map.snapshot(w.map.keyframe_ids), None)
+    zero, _ = adjuster.problem(w.map.snapshot(w.map.keyframe_ids), np.zeros(3))
+    np.testing.assert_allclose(
+        np.nanmedian(zero.inverse_depths - found.inverse_depths), bias, atol=1e-3
+    )
+    change.write(w.map)
+    assert w.ate() < 1.2 * before + 1e-3
+
+
 def test_scales_of_one_camera_stay_and_points_are_in_them():
     worlds = [adjust_world(deep=False, scales=scales, seed=4) for scales in (0.0, 0.3)]
     scales = worlds[1].map.states.scales.copy()

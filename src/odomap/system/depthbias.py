@@ -13,6 +13,9 @@ with the rig's own standard deviations as a prior, b is the mean of a Gaussian i
 
     Λ ← Λ + f H,   Λ b ← Λ b + f (H b + k).
 
+A map that others made does not say with which bias; but its landmarks lie where depths say, less
+that bias, so that a robust fit to what both differ by finds it again.
+
 Reference: Thrun, Burgard, Fox, "Probabilistic Robotics", MIT Press 2005, section 3.5 (the
 information filter); Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999, section 9.
 """
@@ -25,6 +28,11 @@ from odomap.backend.bundle import BundleSolution
 __all__ = ["DepthBias", "bias_at"]
 
 Array = NDArray[np.float64]
+
+HUBER = 1.5
+"""Standard deviations beyond which a depth counts less for the bias that a map is found to have."""
+FITS = 10
+"""Rounds of weighting them."""
 
 
 class DepthBias:
@@ -60,6 +68,26 @@ class DepthBias:
         self._information += weight * H
         self._vector += weight * (H @ self.value + k)
         self.value = np.where(self._learns, np.linalg.solve(self._information, self._vector), 0.0)
+
+    def fitted(self, off: Array, bearings: Array, sigma: float) -> Array:
+        """Return the bias (3,) that a map was made with, which no file keeps.
+
+        Landmarks of a map that was solved with a bias b lie where its depths say, less b.
+
+        Args:
+            off: (N,) measured inverse depths less those of the landmarks, 1/m.
+            bearings: (N, 3) rays along which they were measured.
+            sigma: standard deviation of a measured inverse depth, 1/m.
+        """
+        A = np.stack([np.ones(len(off)), *(bearings[:, :2] / bearings[:, 2:]).T], axis=1)
+        value = np.zeros(3)
+        for _ in range(FITS):
+            error = np.abs(off - A @ value) / sigma
+            weighted = A * (np.minimum(1.0, HUBER / np.maximum(error, HUBER)) / sigma**2)[:, None]
+            information = np.where(np.outer(self._learns, self._learns), weighted.T @ A, 0.0)
+            found = np.linalg.solve(information + self._information, weighted.T @ off)
+            value = np.where(self._learns, found, 0.0)
+        return value
 
 
 def bias_at(bias: Array, bearings: Array) -> Array:

@@ -113,18 +113,24 @@ class GlobalAdjuster:
         self._waits = None
         return GlobalJob(self, self._map, np.array(self._bias.value))
 
-    def problem(self, snapshot: Snapshot, bias: Array) -> tuple[Adjustment, Index] | None:
+    def whole(self) -> "GlobalJob":
+        """Begin to adjust a map that others have made, with the bias that is found in it."""
+        return GlobalJob(self, self._map, None)
+
+    def problem(self, snapshot: Snapshot, bias: Array | None) -> tuple[Adjustment, Index] | None:
         """Return a map as a bundle, and the rows (N,) of the snapshot that its observations are.
 
         A landmark that one keyframe sees tells nothing about where keyframes are, and hangs on.
-        None where too little was seen to adjust anything.
+        None where too little was seen to adjust anything. A bias of None is found in the map.
         """
         has_features = np.array([k.features is not None for k in snapshot.keyframes], bool)
         is_sight = has_features[snapshot.obs_keyframe]
         seen = np.bincount(snapshot.obs_landmark, is_sight, minlength=len(snapshot.landmark_ids))
         rows = np.flatnonzero(is_sight & (seen[snapshot.obs_landmark] > 1))
         bearings, depths, levels = _measured(snapshot, rows)
-        inverse = 1.0 / depths - bias_at(bias, bearings)
+        inverse = 1.0 / depths
+        bias = self._bias_in(snapshot, rows, bearings, inverse) if bias is None else bias
+        inverse -= bias_at(bias, bearings)
         if not _is_told(snapshot, rows, int(np.isfinite(inverse).sum())):
             return None
         first = np.arange(len(snapshot.keyframes)) == 0
@@ -142,6 +148,15 @@ class GlobalAdjuster:
             depth_weights=np.full(len(rows), 1.0 / self._depth_sigma),
         )
         return problem, rows
+
+    def _bias_in(self, s: Snapshot, rows: Index, bearings: Array, inverse: Array) -> Array:
+        """Return the bias (3,) by which landmarks and measured inverse depths (N,) differ."""
+        k, landmark = s.obs_keyframe[rows], s.obs_landmark[rows]
+        T = self._T_camera_body @ se3_inverse(s.Ts_world_body)
+        z = np.einsum("nj,nj->n", T[k, 2, :3], s.points_world[landmark]) + T[k, 2, 3]
+        off = inverse - 1.0 / np.where(z > 0.0, z, np.nan)
+        is_known = np.isfinite(off)
+        return self._bias.fitted(off[is_known], bearings[is_known], self._depth_sigma)
 
     def solve(self, problem: Adjustment, stop: Stop | None) -> AdjustmentSolution:
         """Adjust, until there is nothing to gain or all steps are spent."""
@@ -183,10 +198,10 @@ class GlobalJob:
     Args:
         adjuster: whose job it is.
         map: what to read.
-        bias: (3,) what all measured depths are off by, 1/m.
+        bias: (3,) what all measured depths are off by, 1/m; None where that is to be found.
     """
 
-    def __init__(self, adjuster: GlobalAdjuster, map: Map, bias: Array) -> None:
+    def __init__(self, adjuster: GlobalAdjuster, map: Map, bias: Array | None) -> None:
         self._adjuster, self._map, self._bias = adjuster, map, bias
         self._snapshot: Snapshot | None = None
 
