@@ -5,9 +5,10 @@
 
 Each map is in a world of its own. Places of the second are recognised among those of the first by
 what they show, and measured; from these the second is brought to the first, in size, too, if they
-were made with one camera, and landmarks that are the same become one. Neither is changed. Maps that
-cannot be one are refused before anything is compared: other cameras, no descriptors. Words of
-places are no part of a map: they are made anew, whatever vocabulary it was made with.
+were made with one camera, and landmarks that are the same become one; where depth was measured all
+is adjusted together. Neither is changed. Maps that cannot be one are refused before anything is
+compared: other cameras, no descriptors. Words of places are no part of a map: they are made anew,
+whatever vocabulary it was made with.
 """
 
 from collections.abc import Callable
