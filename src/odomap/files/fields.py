@@ -56,7 +56,7 @@ def read_yaml(path: Path) -> "Fields":
         text = "\n" + text.partition("\n")[2]
     try:
         content = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or "broken"
