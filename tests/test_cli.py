@@ -152,7 +152,7 @@ def test_no_words_prints_help_and_fails(cli):
         (
             ["frobnicate"],
             "one of run, localize, continue, merge, demo, calibrate, eval, optimize, bundle, "
-            "export, vocabulary, loops, info, view, config, doctor expected",
+            "register, export, vocabulary, loops, info, view, config, doctor expected",
         ),
         (["run"], "DATA is missing"),
         (["run", "x", "--prest", "y"], "unknown option '--prest' (did you mean '--preset'?)"),

@@ -23,6 +23,7 @@ from odomap.cli.localize import Continue, Localize
 from odomap.cli.loops import Loops
 from odomap.cli.merge import Merge
 from odomap.cli.optimize import Optimize
+from odomap.cli.register import Register
 from odomap.cli.run import Run
 from odomap.cli.view import ViewVerb
 from odomap.cli.vocabulary import VocabularyVerb
@@ -41,6 +42,7 @@ VERBS: dict[str, Any] = {
     "eval": Evaluate,
     "optimize": Optimize,
     "bundle": Bundle,
+    "register": Register,
     "export": Export,
     "vocabulary": VocabularyVerb,
     "loops": Loops,

@@ -86,19 +86,17 @@ def judge(
         return Certainty(nothing, np.eye(len(free)), error, "hardly any surface was met")
     radius = max(float(np.sqrt(np.mean(np.sum(p * p, axis=1)))), 1e-12)
     variance = max(_variance(r, len(free)), (EXACT * radius) ** 2)
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -hat(p)], axis=2)
-    across = np.einsum("ni,nij->nj", n, J)
-    along = (J - n[:, :, None] * across[:, None, :]) * np.sqrt(_tilts(spreads))[:, None, None]
-    if planar:
-        along[:, 2] = J[:, 2] = 0.0
-    across, along, J = across[:, free], along.reshape(-1, 6)[:, free], J.reshape(-1, 6)[:, free]
-    noise = along.T @ along / len(r)
-    motion = J.T @ J / len(r) + 1e-12 * np.diag(np.where(free < 3, 1.0, radius * radius))
+    across = np.concatenate([n, np.cross(p, n)], axis=1)
+    tilt = _tilts(spreads)
+    noise = _motion(p, tilt) - across.T @ (across * tilt[:, None]) / len(r)
+    motion = _motion(p, np.ones(len(p))) + 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
+    fits = across.T @ across / len(r) - noise
+    noise, motion, fits = (M[np.ix_(free, free)] for M in (noise, motion, fits))
     L = np.linalg.cholesky(motion)
     inverse = np.linalg.inv(L)
-    shares, axes = np.linalg.eigh(inverse @ (across.T @ across / len(r) - noise) @ inverse.T)
+    shares, axes = np.linalg.eigh(inverse @ fits @ inverse.T)
     shares = np.maximum(shares, 0.0)
-    chance = np.sum((along @ inverse.T @ axes) ** 2, axis=0) / len(r)
+    chance = np.einsum("ji,jk,ki->i", axes, inverse @ noise @ inverse.T, axes)
     is_weak = shares < LEAST_SHARE + NOISE_FACTOR * chance
     weak = (inverse.T @ axes).T[is_weak]
     root = L @ axes * np.sqrt(shares)
@@ -108,6 +106,16 @@ def judge(
     information = root @ root.T * (len(r) / variance)
     lever = np.where(free < 3, 1.0, radius)
     return Certainty(information, weak, error, _sentence(weak * lever, planar))
+
+
+def _motion(p: Array, w: Array) -> Array:
+    """Return (6, 6) the mean of w Jᵀ J, J = [I -p^], from the moments of the points."""
+    first, second = p.T @ w, p.T @ (p * w[:, None])
+    K = np.empty((6, 6))
+    K[:3, :3] = w.sum() * np.eye(3)
+    K[:3, 3:], K[3:, :3] = -hat(first), hat(first)
+    K[3:, 3:] = np.trace(second) * np.eye(3) - second
+    return np.asarray(K / len(p))
 
 
 def _variance(r: Array, used: int) -> float:

@@ -7,9 +7,13 @@ drawn from a disc that lies in its surface, of unit size along it and thin (ε) 
 
 Then Σ eᵀ M e with M = (C_q + R C_p Rᵀ)⁻¹ slides where both surfaces agree that it may, counts a
 pair on surfaces that do not agree like a pair of points, and is symmetric in both clouds. In the
-paper ε is 10⁻³ everywhere; here that is the least, and ε = λ₀ / size² where points are scattered
-across: a few far ones with a long lever would else turn the cloud. With normals scaled to
-n' = √(1-ε) n, m' = √(1-ε) R n_p and k = n'ᵀm' the inverse has a closed form (Woodbury's),
+paper ε is 10⁻³ everywhere; here that is the least, and the thickness seen around a point counts,
+together with ten points' worth of the mean thickness λ̄ of the cloud, since few points are flat by
+chance: four far ones, with a lever of 40 m, turned a real cloud by a degree,
+
+    ε = (n λ₀ + 10 λ̄) / (n size²)
+
+With n' = √(1-ε) n, m' = √(1-ε) R n_p and k = n'ᵀm' the inverse has a closed form (Woodbury's),
 
     M = ½ I + ½/d ((2 - |m'|²) n'n'ᵀ + (2 - |n'|²) m'm'ᵀ + k (n'm'ᵀ + m'n'ᵀ)),
     d = (2 - |n'|²)(2 - |m'|²) - k²
@@ -31,7 +35,9 @@ __all__ = ["EPSILON", "disc_metric_into", "discs", "warm_up"]
 Array = NDArray[np.float64]
 
 EPSILON = 1e-3
-"""Thickness of a disc, as a share of its size, squared."""
+"""Least thickness of a disc, as a share of its size, squared."""
+PRIOR = 10.0
+"""Points' worth of the mean thickness that counts beside what is seen around a point."""
 
 
 def discs(normals: Array, spreads: Array, size: float) -> Array:
@@ -42,7 +48,10 @@ def discs(normals: Array, spreads: Array, size: float) -> Array:
         spreads: (N, 4) number of points around each, and the eigenvalues of their covariance.
         size: of a disc, metres.
     """
-    epsilon = np.clip(spreads[:, 1] / (size * size), EPSILON, 1.0)
+    count, thickness = np.maximum(spreads[:, 0], 1.0), spreads[:, 1]
+    known = spreads[:, 0] > 0.0
+    mean = float(thickness[known].mean()) if known.any() else 0.0
+    epsilon = np.clip((thickness + PRIOR * mean / count) / (size * size), EPSILON, 1.0)
     return np.asarray(normals * np.sqrt(1.0 - epsilon)[:, None])
 
 

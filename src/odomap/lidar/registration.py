@@ -20,6 +20,7 @@ Reference: F. Pomerleau, F. Colas, R. Siegwart, "A review of point cloud registr
 mobile robotics", Foundations and Trends in Robotics 4(1), 2015.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -32,7 +33,7 @@ from odomap.geometry.robust import Loss
 from odomap.lidar.alignment import GICP, ICP, PLANE, Aligned, Stage, align
 from odomap.lidar.cloud import Cloud, HasPoints, cloud_of
 from odomap.lidar.degeneracy import judge
-from odomap.lidar.target import FEWEST, Sampled, Target, sample
+from odomap.lidar.target import FEWEST, Sampled, Target, check_enough, sample, suitable_voxel
 from odomap.limits import Count, check_limits
 
 __all__ = ["METHODS", "Method", "Registration", "RegistrationConfig", "register"]
@@ -130,7 +131,7 @@ class Registration:
 
 
 def register(
-    source: ArrayLike | Cloud | HasPoints,
+    source: ArrayLike | Cloud | HasPoints | Sampled,
     target: ArrayLike | Cloud | HasPoints | Target,
     method: Method | None = None,
     *,
@@ -144,7 +145,8 @@ def register(
     """Find how a source lies in a target.
 
     Args:
-        source: (N, 3) or (N, 2) points, a cloud, or anything with points; NaN rows are dropped.
+        source: (N, 3) or (N, 2) points, a cloud, or anything with points; NaN rows are dropped; or
+            what `sample` made of it before.
         target: as the source; or a `Target` made of it before.
         method: "gicp", "plane" or "icp"; default that of the config.
         initial: first guess of T_target_source, (4, 4), or (3, 3) in the plane; default identity.
@@ -166,14 +168,7 @@ def register(
         (True, array([-0.02,  0.  ,  0.  ]))
     """
     config = _settings(config, method, max_distance, voxel, loss, threads)
-    if not isinstance(target, Target):
-        target = Target.of(target, config.voxel, config.max_distance, config.neighbours)
-    cloud = cloud_of(source)
-    if cloud.is_planar != target.is_planar:
-        which = ("target", "source") if cloud.is_planar else ("source", "target")
-        raise InputError(f"register: the {which[1]} is of the plane, the {which[0]} is not")
-    given = target.spacing if config.voxel is None else config.voxel
-    sampled = sample(cloud, given, config.neighbours, "source")
+    sampled, target = _prepared(source, target, config)
     R, t = _centred(_first_guess(initial, target.is_planar), sampled.origin, target.origin)
     code = {"icp": ICP, "plane": PLANE, "gicp": GICP}[config.method]
     aligned = align(
@@ -207,6 +202,41 @@ def _settings(
     }
     changed = {name: value for name, value in given.items() if value is not None}
     return replace(config or RegistrationConfig(), **changed)  # type: ignore[arg-type]
+
+
+def _prepared(
+    source: ArrayLike | Cloud | HasPoints | Sampled,
+    target: ArrayLike | Cloud | HasPoints | Target,
+    config: RegistrationConfig,
+) -> tuple[Sampled, Target]:
+    """Return both clouds ready to be aligned, made side by side where there are threads for it."""
+    first = source if isinstance(source, Sampled) else cloud_of(source)
+    second = target if isinstance(target, Target) else cloud_of(target)
+    if first.is_planar != second.is_planar:
+        flat, solid = ("source", "target") if first.is_planar else ("target", "source")
+        raise InputError(f"register: the {flat} is of the plane, the {solid} is not")
+    voxel = config.voxel
+    if isinstance(second, Cloud):
+        check_enough(len(second), second, "target")
+        voxel = suitable_voxel(second) if voxel is None else voxel
+    elif voxel is None:
+        voxel = second.spacing
+
+    def make_target() -> Target:
+        if isinstance(second, Target):
+            return second
+        return Target.of(second, voxel, config.max_distance, config.neighbours)
+
+    def make_source() -> Sampled:
+        if isinstance(first, Sampled):
+            return first
+        return sample(first, voxel, config.neighbours, "source")
+
+    if config.threads == 1:
+        return make_source(), make_target()
+    with ThreadPoolExecutor(1) as pool:
+        making = pool.submit(make_target)
+        return make_source(), making.result()
 
 
 def _first_guess(initial: ArrayLike | SE3 | SE2 | None, planar: bool) -> Array:

@@ -25,7 +25,7 @@ from odomap.lidar.neighbours import Grid, typical_cell
 from odomap.lidar.normals import cell_covariances, nearest_covariances, normals_of
 from odomap.lidar.voxels import into_cells, mean_points
 
-__all__ = ["FEWEST", "Sampled", "Target", "sample", "suitable_voxel"]
+__all__ = ["FEWEST", "Sampled", "Target", "check_enough", "sample", "suitable_voxel"]
 
 Array = NDArray[np.float64]
 
