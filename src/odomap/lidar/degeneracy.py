@@ -4,19 +4,18 @@ The problem: a corridor fixes everything but the way along it, yet the pairs of 
 there as much as elsewhere, since nearest points slide along. What fixes a motion is the surface:
 with the target's normals n and residuals r = nᵀ(q - T p), by a right update T exp(ξ),
 
-    I = (1/σ²) Σ a aᵀ,    a = (Rᵀn, p × Rᵀn),    σ² = Σ r² / (N - 6), without what is beyond 3 σ
+    I = (1/σ²) Σ f a aᵀ,    a = (Rᵀn, p × Rᵀn),    σ² = Σ r² / (N - 6), without what is beyond 3 σ
 
-whatever the method. But normals are noisy, too: one tilted by δ (`normals`) speaks for its own
-tangent plane with weight δ², and ten thousand of them make a corridor look known. That share,
+whatever the method; f is the share of its points that a pair has for its own (`target`). But
+normals are noisy: one tilted by δ (`normals`) speaks for its own tangent plane with weight δ², and
+ten thousand make a corridor look known. That, (1/σ²) Σ f δ² Jᵀ(I - n nᵀ) J, is subtracted.
+A motion moves points by Σ f |J ξ|² = ξᵀ K ξ, and across the surface by σ² ξᵀ I ξ; an eigenvalue of
+σ² I against K is the share of a motion that is seen. It is weak where less than 0.1 % is seen, or
+less than may be chance, three times the share of the noise.
 
-    I_noise = (1/σ²) Σ Jᵀ δ² (I - n nᵀ) J,
-
-is subtracted. A motion moves the points by Σ |J ξ|² = ξᵀ K ξ, and across the surface by σ² ξᵀ I ξ;
-an eigenvalue of σ² I against K is the share of a motion that is seen. One of which less than 0.1 %
-is seen, or less than what may be chance, three times the share of the noise, is weak.
-
-Pairs are counted as if their errors were independent; where they share what a model does not
-say (curvature, motion within a sweep) the motion is less sure than I says.
+Errors are taken for independent; where pairs share what the model does not say (edges, curvature,
+motion within a sweep) a motion is less sure than I says. Simulated rooms: the square of the error
+in units of I is 0.7 to 1.6 of what it should be for gicp, up to 5 for planes.
 
 Reference: J. Zhang, M. Kaess, S. Singh, "On degeneracy of optimization-based state estimation
 problems", ICRA 2016.
@@ -51,7 +50,7 @@ class Certainty:
     Attributes:
         information: (6, 6), or (3, 3) of x, y, θ in the plane.
         weak_directions: (K, 6) or (K, 3) tangents about the source's mean that are not fixed,
-            weakest first, each of a length that moves the points by 1 m, root mean square.
+            rotations first, each of a length that moves the points by 1 m, root mean square.
         error: root mean square distance from the target's surface, metres.
         reason: names the weak directions; empty if there is none.
     """
@@ -63,7 +62,7 @@ class Certainty:
 
 
 def judge(
-    p: Array, e: Array, n: Array, spreads: Array, R: Array, origin: Array, planar: bool
+    p: Array, e: Array, n: Array, spreads: Array, own: Array, R: Array, origin: Array, planar: bool
 ) -> Certainty:
     """Say how well pairs fix a motion.
 
@@ -71,7 +70,8 @@ def judge(
         p: (N, 3) source points about their mean.
         e: (N, 3) from where they lie in the target to their counterparts.
         n: (N, 3) the target's normals there, zero where there is none.
-        spreads: (N, 4) number of points behind each normal, and their eigenvalues.
+        spreads: (N, 5) number of points behind each normal, and their eigenvalues.
+        own: (N,) the share of what a pair was made of that is its own.
         R: (3, 3) source to target.
         origin: (3,) the source's mean: the motion is that of its frame, not of its middle.
         planar: whether x, y and θ alone are free.
@@ -81,16 +81,17 @@ def judge(
     r = np.where(has_normal, np.sum(n * e, axis=1), np.linalg.norm(e, axis=1))
     error = float(np.sqrt(np.mean(r * r))) if len(r) else 0.0
     p, r, spreads, n = p[has_normal], r[has_normal], spreads[has_normal], n[has_normal] @ R
+    own = own[has_normal]
     if len(r) <= len(free):
         nothing = np.zeros((len(free), len(free)))
         return Certainty(nothing, np.eye(len(free)), error, "hardly any surface was met")
     radius = max(float(np.sqrt(np.mean(np.sum(p * p, axis=1)))), 1e-12)
     variance = max(_variance(r, len(free)), (EXACT * radius) ** 2)
     across = np.concatenate([n, np.cross(p, n)], axis=1)
-    tilt = _tilts(spreads)
+    tilt = own * _tilts(spreads)
     noise = _motion(p, tilt) - across.T @ (across * tilt[:, None]) / len(r)
-    motion = _motion(p, np.ones(len(p))) + 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
-    fits = across.T @ across / len(r) - noise
+    motion = _motion(p, own) + 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
+    fits = across.T @ (across * own[:, None]) / len(r) - noise
     noise, motion, fits = (M[np.ix_(free, free)] for M in (noise, motion, fits))
     L = np.linalg.cholesky(motion)
     inverse = np.linalg.inv(L)
@@ -98,7 +99,7 @@ def judge(
     shares = np.maximum(shares, 0.0)
     chance = np.einsum("ji,jk,ki->i", axes, inverse @ noise @ inverse.T, axes)
     is_weak = shares < LEAST_SHARE + NOISE_FACTOR * chance
-    weak = (inverse.T @ axes).T[is_weak]
+    weak = _parted((inverse.T @ axes).T[is_weak], 2 if planar else 3)
     root = L @ axes * np.sqrt(shares)
     shift = np.eye(6)
     shift[:3, 3:] = -hat(origin)
@@ -131,6 +132,17 @@ def _tilts(spreads: Array) -> Array:
     return np.asarray(np.minimum(least * middle / (n * (middle - least) ** 2), 1.0))
 
 
+def _parted(weak: Array, turns: int) -> Array:
+    """Return weak directions (K, D) turned among themselves so that as few as can be are rotations.
+
+    Of directions that are as weak any mixture is as good; from column `turns` on they turn.
+    """
+    if not len(weak):
+        return weak
+    mix = np.linalg.svd(weak[:, turns:])[0]
+    return np.asarray(mix.T @ weak)
+
+
 def _sentence(weak: Array, planar: bool) -> str:
     """Name weak directions: along what the source may slide, about what it may turn."""
     if not len(weak):
@@ -148,4 +160,4 @@ def _sentence(weak: Array, planar: bool) -> str:
 def _axis(vector: Array) -> str:
     unit = vector / np.linalg.norm(vector)
     unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
-    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in unit) + ")"
+    return "(" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in unit.tolist()) + ")"

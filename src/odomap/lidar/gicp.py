@@ -45,7 +45,7 @@ def discs(normals: Array, spreads: Array, size: float) -> Array:
 
     Args:
         normals: (N, 3) unit, or zero where there is none.
-        spreads: (N, 4) number of points around each, and the eigenvalues of their covariance.
+        spreads: (N, 5) number of points around each, and the eigenvalues of their covariance.
         size: of a disc, metres.
     """
     count, thickness = np.maximum(spreads[:, 0], 1.0), spreads[:, 1]

@@ -51,7 +51,7 @@ LINE = 0.03
 
 @kernel
 def _around_kernel(keys: Index, sums: Array, table: Index, size: float, out: Array) -> None:
-    """Out = n, C (xx, xy, xz, yy, yz, zz), number of cells: of the points in 27 cells."""
+    """Out = n, C (xx, xy, xz, yy, yz, zz), cells, p̄ - mean, own share: of points in 27 cells."""
     for cell in range(keys.shape[0]):
         key = keys[cell]
         i, j, k = axis_of_key(key, 0), axis_of_key(key, 1), axis_of_key(key, 2)
@@ -75,6 +75,11 @@ def _around_kernel(keys: Index, sums: Array, table: Index, size: float, out: Arr
                     zz += sums[o, 9] + 2.0 * z * w + m * z * z
         sx, sy, sz = sx / n, sy / n, sz / n
         out[cell, 0], out[cell, 7] = n, occupied
+        m = sums[cell, 0]
+        out[cell, 8] = sx - sums[cell, 1] / m
+        out[cell, 9] = sy - sums[cell, 2] / m
+        out[cell, 10] = sz - sums[cell, 3] / m
+        out[cell, 11] = m / n
         out[cell, 1], out[cell, 2], out[cell, 3] = (
             xx / n - sx * sx,
             xy / n - sx * sy,
@@ -89,7 +94,7 @@ def _around_kernel(keys: Index, sums: Array, table: Index, size: float, out: Arr
 
 @kernel
 def _nearest_kernel(points: Array, queries: Index, rows: Index, out: Array) -> None:
-    """Out = n, C, n again, of the nearest of each query; about the query, for precision."""
+    """Out = n, C, n, 0, 1 of the nearest of each query; about the query, for precision."""
     for q in range(rows.shape[0]):
         p = queries[q]
         n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
@@ -106,6 +111,7 @@ def _nearest_kernel(points: Array, queries: Index, rows: Index, out: Array) -> N
             yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
         sx, sy, sz = sx / n, sy / n, sz / n
         out[p, 0], out[p, 7] = n, n
+        out[p, 8], out[p, 9], out[p, 10], out[p, 11] = 0.0, 0.0, 0.0, 1.0
         out[p, 1], out[p, 2] = xx / n - sx * sx, xy / n - sx * sy
         out[p, 3] = xz / n - sx * sz
         out[p, 4], out[p, 5] = yy / n - sy * sy, yz / n - sy * sz
@@ -132,7 +138,7 @@ def _longest_cross(
 
 @kernel
 def _normal_kernel(spread: Array, planar: bool, normals: Array, tilts: Array) -> None:
-    """Normals v₀ of spreads n, C, unless the points lie on a line; tilts: n (0: none), λ₀, λ₁, λ₂.
+    """Normals v₀ of spreads n, C, unless the points lie on a line; tilts: n (0: none), λ, share.
 
     λ = m + 2 p cos(φ + 2πk/3),  m = tr C / 3,  p² = |C - m I|² / 6,  φ = ⅓ acos(det(C - m I) / 2p³)
     """
@@ -158,10 +164,12 @@ def _normal_kernel(spread: Array, planar: bool, normals: Array, tilts: Array) ->
         normals[r, 0], normals[r, 1], normals[r, 2] = x * size, y * size, z * size
         tilts[r, 0] = spread[r, 0] if known else 0.0
         tilts[r, 1], tilts[r, 2], tilts[r, 3] = max(least, 0.0), middle, largest
+        tilts[r, 4] = spread[r, 11]
 
 
 def cell_covariances(cells: Cells, means: Array, k: int, planar: bool = False) -> Array:
-    """Return (V, 8) number of points and covariance around each cell, and how many cells tell so.
+    """Return (V, 12) what is around each cell: number of points, their covariance, cells occupied,
+    from the cell's mean to theirs, and the cell's own share of them.
 
     Args:
         cells: the occupied ones.
@@ -169,7 +177,7 @@ def cell_covariances(cells: Cells, means: Array, k: int, planar: bool = False) -
         k: how many of the nearest means are taken where too few cells are occupied around one.
         planar: whether points lie in the plane z = 0.
     """
-    spread = np.empty((len(cells), 8))
+    spread = np.empty((len(cells), 12))
     _around_kernel(cells.keys, cells.sums, cells.table, cells.size, spread)
     fewest = FEWEST_CELLS_IN_PLANE if planar else FEWEST_CELLS
     few = np.flatnonzero((spread[:, 0] < FEWEST) | (spread[:, 7] < fewest))
@@ -178,8 +186,8 @@ def cell_covariances(cells: Cells, means: Array, k: int, planar: bool = False) -
 
 
 def nearest_covariances(points: Array, k: int) -> Array:
-    """Return (N, 8) number and covariance of the k nearest of each of the points (N, 3)."""
-    spread = np.empty((len(points), 8))
+    """Return (N, 12) the same of the k nearest of each of the points (N, 3), share 1."""
+    spread = np.empty((len(points), 12))
     _from_nearest(points, np.arange(len(points)), k, spread)
     return spread
 
@@ -191,8 +199,8 @@ def _from_nearest(points: Array, which: Index, k: int, spread: Array) -> None:
 
 
 def normals_of(spread: Array, planar: bool) -> tuple[Array, Array]:
-    """Return unit normals (N, 3), zero where there is none; (N, 4) n, λ₀, λ₁, λ₂ around each."""
-    normals, tilts = np.empty((len(spread), 3)), np.empty((len(spread), 4))
+    """Return unit normals (N, 3), zero where there is none; (N, 5) n, λ₀, λ₁, λ₂, own share."""
+    normals, tilts = np.empty((len(spread), 3)), np.empty((len(spread), 5))
     _normal_kernel(spread, planar, normals, tilts)
     return normals, tilts
 

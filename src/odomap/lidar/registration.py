@@ -288,9 +288,9 @@ def _concluded(source: Sampled, target: Target, aligned: Aligned) -> Registratio
     rows = aligned.rows[paired]
     p = source.points[paired]
     e = target.grid.points[rows] - p @ R.T - t
-    certainty = judge(
-        p, e, target.normals[rows], target.spreads[rows], R, source.origin, source.is_planar
-    )
+    normals, spreads = target.normals[rows], target.spreads[rows]
+    own = 0.5 * (source.spreads[paired, 4] + spreads[:, 4])
+    certainty = judge(p, e, normals, spreads, own, R, source.origin, source.is_planar)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t - R @ source.origin + target.origin
     reason = certainty.reason

@@ -5,6 +5,12 @@ leave rotation and translation hardly apart; are down-sampled to one point per v
 normals from the raw points around each voxel, or, where points are taken as they are, from the k
 nearest. A target is sorted into cells for the search as well.
 
+A wall through the boundary of voxels is cut into two layers, each with a mean of its own, which lie
+the farther off the smaller a part it is; pairs of such means are all off to one side, and a room
+was by three millimetres where 0.4 were possible. So means are moved across the surface, by how flat
+it is (`gicp`), onto the mean of all points around, which no boundary cuts. Neighbours then share
+most of what they know: that is why their own share of it is kept (`degeneracy`).
+
 The voxel that suits a cloud is a share of its size, so that nothing depends on the unit: a
 twentieth of the mean distance from the middle (0.25 m where that is 5 m).
 
@@ -43,7 +49,8 @@ class Sampled:
         origin: (3,) its mean, metres.
         points: (N, 3) about that.
         normals: (N, 3), zero where there is none.
-        spreads: (N, 4) number of points around each, and the eigenvalues of their covariance.
+        spreads: (N, 5) number of points around each, the eigenvalues of their covariance, and the
+            share of them that is the point's own.
         spacing: how far points are apart, about.
         is_planar: whether it lies in the plane z = 0.
     """
@@ -70,7 +77,7 @@ class Target:
     Attributes:
         grid: its points about `origin`, sorted for the search.
         normals: (M, 3) in the order of the grid.
-        spreads: (M, 4) as of `Sampled`.
+        spreads: (M, 5) as of `Sampled`.
         discs: (M, 3) normals scaled as `gicp` takes them.
         origin: (3,).
         spacing: how far points are apart, about.
@@ -153,7 +160,11 @@ def sample(cloud: Cloud, voxel: float | None, neighbours: int, name: str) -> Sam
         points[:, 2] = 0.0
     spread = cell_covariances(cells, points, neighbours, cloud.is_planar)
     normals, spreads = normals_of(spread, cloud.is_planar)
-    return Sampled(origin, points, normals, spreads, size, cloud.is_planar)
+    found = Sampled(origin, points, normals, spreads, size, cloud.is_planar)
+    across = np.sum(spread[:, 8:11] * normals, axis=1)
+    flat = np.sum(found.discs() ** 2, axis=1)
+    points += (flat * across)[:, None] * normals
+    return found
 
 
 def suitable_voxel(cloud: Cloud) -> float:
