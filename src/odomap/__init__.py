@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from odomap.files.colmap import write_colmap
     from odomap.files.g2o import read_g2o, write_g2o
     from odomap.files.graphs import read_graph, write_graph
+    from odomap.files.grids import load_grid, save_grid
     from odomap.files.mapfile import MapFile, load_map, save_map
     from odomap.files.rig import read_rig, write_rig
     from odomap.files.trajectories import read_tum, write_tum
@@ -62,11 +63,13 @@ if TYPE_CHECKING:
     from odomap.geometry.robust import Loss
     from odomap.geometry.trajectory import Trajectory
     from odomap.lidar.cloud import Cloud
+    from odomap.lidar.grid import OccupancyGrid
     from odomap.lidar.registration import Registration, register
     from odomap.localize import continue_map, localize
     from odomap.maps.atlas import Atlas
     from odomap.maps.estimate import Estimate, Status
     from odomap.maps.map import Map
+    from odomap.maps.occupancy import occupancy_grid
     from odomap.merge import Merged, merge_maps
     from odomap.run import run
     from odomap.sensors.frame import Frame
@@ -106,6 +109,7 @@ __all__ = [
     "Merged",
     "MissingExtra",
     "MonocularVO",
+    "OccupancyGrid",
     "OdomapError",
     "OutputError",
     "Places",
@@ -138,9 +142,11 @@ __all__ = [
     "covariances",
     "export",
     "joint_covariance",
+    "load_grid",
     "load_map",
     "localize",
     "merge_maps",
+    "occupancy_grid",
     "open",
     "preset",
     "read_bal",
@@ -154,6 +160,7 @@ __all__ = [
     "relative_covariance",
     "rpe",
     "run",
+    "save_grid",
     "save_map",
     "solve",
     "view_covariance",
@@ -188,6 +195,7 @@ _HOMES = {
     "Merged": "merge",
     "MissingExtra": "errors",
     "MonocularVO": "system.odometry",
+    "OccupancyGrid": "lidar.grid",
     "OdomapError": "errors",
     "OutputError": "errors",
     "Places": "vision.places",
@@ -222,9 +230,11 @@ _HOMES = {
     "covariances": "backend.graphs.covariances",
     "export": "export",
     "joint_covariance": "backend.graphs.covariances",
+    "load_grid": "files.grids",
     "load_map": "files.mapfile",
     "localize": "localize",
     "merge_maps": "merge",
+    "occupancy_grid": "maps.occupancy",
     "open": "sources.open",
     "preset": "system.config",
     "read_bal": "files.bal",
@@ -238,6 +248,7 @@ _HOMES = {
     "relative_covariance": "backend.graphs.covariances",
     "rpe": "evaluation.metrics",
     "run": "run",
+    "save_grid": "files.grids",
     "save_map": "files.mapfile",
     "solve": "backend.graphs.solve",
     "view_covariance": "backend.adjustment.covariance",

@@ -1,9 +1,9 @@
-"""`odomap export`: a coloured cloud and a mesh of what a run saw; landmarks and poses of a map."""
+"""`odomap export`: a cloud, a mesh or a grid of what a run saw; landmarks and poses of a map."""
 
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -22,7 +22,8 @@ class Export:
 
     Cloud and mesh are re-made from the run's keyframes, for which its recording is opened again.
     Without options both are written into the run's folder. --points, --trajectory, --graph and
-    --colmap take what the map holds, and need no recording.
+    --colmap take what the map holds, and need no recording. --grid makes an occupancy grid of the
+    map's scans or clouds, or of the recording's depth.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|MAP")]
@@ -35,6 +36,14 @@ class Export:
     """g2o file for the keyframes of the map and the edges between them."""
     colmap: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder for the map as COLMAP text: cameras.txt, images.txt, points3D.txt."""
+    grid: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """YAML file for an occupancy grid as map_server loads it, with a PGM and a PNG beside it."""
+    resolution: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.05
+    """Size of the grid's cells."""
+    height: Annotated[tuple[float, float], tyro.conf.arg(metavar="LOW HIGH")] = (0.1, 1.8)
+    """What is in the way, metres above the floor; of clouds and depth."""
+    up: Literal["gravity", "body"] = "gravity"
+    """What heights are counted along: body for what drives on wheels, up ramps, too."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """PLY file for the coloured points."""
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -48,7 +57,7 @@ class Export:
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml, if it is no longer where the run found it, or a map does not say one."""
     picture: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
-    """Do not draw the mesh."""
+    """Do not draw the mesh or the grid."""
     quiet: bool = False
     """No progress."""
 
@@ -59,16 +68,50 @@ class Export:
             "--trajectory": (self.trajectory, (".tum", ".txt", ".gz")),
             "--graph": (self.graph, (".g2o", ".gz")),
         }
-        if self.colmap is not None or any(file is not None for file, _ in of_map.values()):
+        is_of_map = self.colmap is not None or any(file is not None for file, _ in of_map.values())
+        if is_of_map:
             self._write_map(of_map)
-            if self.cloud is None and self.mesh is None:
-                return 0
-        elif self.run.is_file():
+        if self.grid is not None:
+            self._make_grid(self.grid)
+        if self.cloud is not None or self.mesh is not None:
+            return self._make_surface()
+        if is_of_map or self.grid is not None:
+            return 0
+        if self.run.is_file():
             raise InputError(
-                f"{self.run}: say what of the map: --points, --trajectory or --graph FILE, or "
-                "--colmap FOLDER (a cloud and a mesh are made of a run's folder)"
+                f"{self.run}: say what of the map: --points, --trajectory, --graph or --grid FILE, "
+                "or --colmap FOLDER (a cloud and a mesh are made of a run's folder)"
             )
         return self._make_surface()
+
+    def _make_grid(self, file: Path) -> None:
+        from odomap.gridmap import export_grid
+        from odomap.lidar.slices import SliceConfig
+        from odomap.maps.occupancy import GridConfig
+
+        band = SliceConfig(low=self.height[0], high=self.height[1])
+        config = GridConfig(resolution=self.resolution, slice=band, up=self.up)
+        with Steps("export", self.quiet) as steps:
+            result = export_grid(
+                self.run,
+                file,
+                config,
+                data=self.data,
+                rig=self.rig,
+                picture=self.picture,
+                progress=steps.show,
+            )
+        for note in result.notes:
+            print(f"odomap: {note}", file=sys.stderr)
+        grid = result.made.grid.cropped()
+        wide, high = (grid.resolution * cells for cells in grid.log_odds.shape[::-1])
+        rows = [
+            ("keyframes", f"{len(result.made.path)} with {result.made.made_of}"),
+            ("grid", f"{wide:.1f} x {high:.1f} m, cells of {grid.resolution:g} m"),
+            *(("wrote", str(written)) for written in result.written),
+        ]
+        for name, value in rows:
+            print(f"{name:<16} {value}")
 
     def _write_map(self, wanted: dict[str, tuple[Path | None, tuple[str, ...]]]) -> None:
         from odomap.files.atomic import make_folder

@@ -14,6 +14,7 @@ import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,10 +98,11 @@ def _pgm(path: Path, data: bytes, most: int) -> Grey:
     if not 0 < greatest < 256:
         raise InputError(f"{path}: its greatest value is {greatest}: only 8 bits are read")
     count = width * height
-    if data[:2] == b"P5":
-        values = np.frombuffer(data, np.uint8)[at + 1 : at + 1 + count]
-    else:
-        values = _plain(path, data[at:], count)
+    values: NDArray[np.integer[Any]] = (
+        np.frombuffer(data, np.uint8)[at + 1 : at + 1 + count]
+        if data[:2] == b"P5"
+        else _plain(path, data[at:], count)
+    )
     if len(values) < count:
         raise InputError(f"{path}: ends after {len(values)} of {count} pixels: copy it again")
     if values.max() > greatest:

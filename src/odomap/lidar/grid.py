@@ -115,6 +115,7 @@ class OccupancyGrid:
         *,
         between: Array | None = None,
         free: Array | None = None,
+        free_from: Array | None = None,
     ) -> None:
         """Add what a scan says.
 
@@ -123,22 +124,27 @@ class OccupancyGrid:
             hits: (N, 2) where beams came back from.
             between: (M, 2) further points of the surfaces there, which no beam went to.
             free: (F, 2) ends of beams that met nothing.
+            free_from: (F, 2) where they begin to be seen; by default at the scanner.
 
         Raises:
             ValueError: a point is not finite, or so far away that it cannot be true.
         """
         nothing = np.zeros((0, 2))
         between, free = (nothing if x is None else x for x in (between, free))
-        self._hold(np.concatenate([hits, between, free, np.reshape(sensor, (1, 2))]))
+        starts = np.empty((len(hits) + len(free), 2))
+        starts[:] = sensor
+        if free_from is not None:
+            starts[len(hits) :] = free_from
+        self._hold(np.concatenate([hits, between, free, starts, np.reshape(sensor, (1, 2))]))
         self._count += 1
         cells, evidence = 1.0 / self.resolution, self.evidence
         ends = (np.concatenate([hits, between, free]) - self.origin) * cells
-        x, y = (np.asarray(sensor) - self.origin) * cells
+        starts = (starts - self.origin) * cells
         occupied = len(hits) + len(between)
         parts = self.log_odds, self._marks, self._count
         hit_cells(*parts, ends[:occupied], evidence.hit, evidence.limit)
         rays = np.concatenate([ends[: len(hits)], ends[occupied:]])
-        pass_cells(*parts, x, y, rays, evidence.miss, evidence.limit)
+        pass_cells(*parts, starts, rays, evidence.miss, evidence.limit)
 
     def probability(self, points: Array) -> Array:
         """Return how likely (N, 2) points are occupied, (N,); 0.5 where nothing is known."""
@@ -211,8 +217,7 @@ def pass_cells(
     log_odds: Cells,
     marks: Marks,
     mark: int,
-    sensor_x: float,
-    sensor_y: float,
+    starts: Array,
     ends: Array,
     miss: float,
     limit: float,
@@ -223,6 +228,7 @@ def pass_cells(
     comes first, and after it the next border is 1 / |d| further.
     """
     for i in range(len(ends)):
+        sensor_x, sensor_y = starts[i, 0], starts[i, 1]
         x, y = int(np.floor(sensor_x)), int(np.floor(sensor_y))
         dx, dy = ends[i, 0] - sensor_x, ends[i, 1] - sensor_y
         right, up = 1 if dx > 0.0 else -1, 1 if dy > 0.0 else -1
