@@ -67,6 +67,13 @@ def test_what_is_saved_is_loaded(files, tmp_path):
     assert files.load(KEY) is None
 
 
+def test_what_is_there_stays(files):
+    """Another process may have loaded it, and a second compilation may differ in its last bits."""
+    files.save(KEY, "first")
+    files.save(KEY, "second")
+    assert files.load(KEY) == "first"
+
+
 def test_what_an_older_source_left_is_not_loaded_and_written_over(files, tmp_path):
     files.save(KEY, "old")
     newer = SignatureFiles(tmp_path, "module.name-7.py311", "newer")

@@ -3,7 +3,9 @@
 Numba compiles under a lock of the whole process, so threads do not help, but processes do, as each
 finds on disk what the others left (`kernelfiles`). A process begins alone: as long as all is loaded
 from the cache, nobody is called. The first kernel that has to be compiled calls helpers: the same
-interpreter on the same paths, which compiles until all modules are taken, and goes.
+interpreter on the same paths, which compiles until all modules are taken, and goes. The caller
+waits and loads what they left, as every later run will: the same code compiled twice may differ in
+the order of a sum, and a run that compiled must give the same bytes as those after it.
 
 Modules are shared out through a folder of empty files, whose names say how far each of them is:
 `a.free` becomes `a.by1` when helper 1 takes it, and then `a.done`. Renaming is atomic, so one alone
@@ -12,8 +14,9 @@ call; and of those that may be taken, first the one on which most source code wa
 scheduling (Graham, Bounds on multiprocessing timing anomalies, SIAM J. Appl. Math. 1969) leaves two
 processes idle for less than a tenth of the time.
 
-A helper that fails or dies is no error: what it had is free again, the caller compiles it and finds
-out what is wrong. Helpers end with their caller, however that ends: their stdin is a pipe from it.
+A helper that fails or dies is no error: what it had is free again, and where none is left the
+caller compiles it and finds out what is wrong. Helpers end with their caller, however that ends:
+their stdin is a pipe from it.
 """
 
 import contextlib
@@ -41,7 +44,7 @@ Tell = Callable[[int, int, str], None]
 """Progress: modules done, modules in all, which is next."""
 
 MOST = 4
-"""Processes at most, the caller's own among them."""
+"""Helpers at most."""
 GB_EACH = 1.0
 """Memory of the machine that there must be for each of them."""
 FEW = 4
@@ -142,13 +145,18 @@ class _Share:
 def _compile_with(
     share: _Share, helpers: "list[subprocess.Popen[bytes]]", tell: Callable[[int, str], None]
 ) -> list[str]:
-    """Compile beside helpers until all modules are done; return those that they have done."""
+    """Wait until all modules are done, or compile them; return those that helpers have done."""
     mine: set[str] = set()
+    told = -1
     while len(done := share.names("done")) < len(share.calls):
-        for number, helper in enumerate(helpers, start=1):
-            if helper.poll() is not None:
+        if len(done) > told and (now := share.names(f"by{1 + len(done) % max(len(helpers), 1)}")):
+            told = len(done)
+            tell(told, min(now))
+        is_gone = [helper.poll() is not None for helper in helpers]
+        for number, gone in enumerate(is_gone, start=1):
+            if gone:
                 share.free(number)
-        if name := share.take():
+        if all(is_gone) and (name := share.take()):
             tell(len(done), name)
             kernels.warm_up(name)
             share.finish(name)
@@ -207,13 +215,13 @@ def _go_with_caller() -> None:
 
 
 def _num_helpers() -> int:
-    """Return how many processes to start: one for each core and gigabyte that the caller leaves."""
+    """Return how many processes to start: one for each core and gigabyte; none for a single one."""
     is_python = Path(sys.executable or "").stem.lower().startswith("python")
     if not is_python or getattr(sys, "frozen", False):  # starting it would start the program again
         return 0
     memory_gb = total_memory_gb()
     most = min(MOST, num_cores(), int(memory_gb / GB_EACH) if memory_gb else 2)
-    return max(most - 1, 0)
+    return most if most > 1 else 0
 
 
 def _has_compiled(name: str) -> bool:

@@ -48,7 +48,12 @@ class SignatureFiles:
         self._head = (numba.__version__, stamp)
 
     def save(self, key: object, data: object) -> None:
-        """Write what was compiled for a key: signature, processor and hash of the code."""
+        """Write what was compiled for a key: signature, processor and hash of the code.
+
+        What another process wrote meanwhile stays: it may have been loaded already.
+        """
+        if self.load(key) is not None:
+            return
         import numba.core.serialize
 
         dumps: Callable[[object], bytes] = numba.core.serialize.dumps
