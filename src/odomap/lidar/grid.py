@@ -9,7 +9,7 @@ evidence adds up,
 lets a door that opened be seen open soon. On their way rays are followed from border to border of
 the cells. The grid grows where points come to lie beyond it.
 
-Cost: O(cells on the rays), some 2 ns each.
+Cost: O(cells on the rays), some 5 ns each.
 
 Reference: H. Moravec, A. Elfes, "High resolution maps from wide angle sonar", ICRA 1985;
 J. Amanatides, A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics 1987.
@@ -172,10 +172,10 @@ class OccupancyGrid:
 
     def _hold(self, points: Array) -> None:
         """Grow until points (N, 2) lie inside."""
-        if not np.isfinite(points).all():
+        box = np.empty((2, 2))
+        if not find_box(points, box):
             raise ValueError("a point of a scan is not finite")
-        low = np.floor((points.min(axis=0) - self.origin) / self.resolution).astype(np.int64)
-        high = np.floor((points.max(axis=0) - self.origin) / self.resolution).astype(np.int64)
+        low, high = np.floor((box - self.origin) / self.resolution).astype(np.int64)
         shape = np.array(self.log_odds.shape[::-1])
         if (low >= 0).all() and (high < shape).all():
             return
@@ -198,6 +198,20 @@ def _moved(cells: NDArray[C], before: NDArray[np.int64], size: NDArray[np.int64]
     if cells.size:
         larger[before[1] : before[1] + height, before[0] : before[0] + width] = cells
     return larger
+
+
+@kernel
+def find_box(points: Array, box: Array) -> bool:
+    """box ← the least and the greatest x and y; False if one of them is not finite."""
+    for k in range(2):
+        box[0, k], box[1, k] = np.inf, -np.inf
+    for i in range(len(points)):
+        for k in range(2):
+            if not np.isfinite(points[i, k]):
+                return False
+            box[0, k] = min(box[0, k], points[i, k])
+            box[1, k] = max(box[1, k], points[i, k])
+    return True
 
 
 @kernel
@@ -225,29 +239,33 @@ def pass_cells(
     """l ← max(l - miss, -limit) in the cells on the way to points, once each, without the last.
 
     A ray enters the next column at t = (border - x) / dx and the next row likewise; the smaller
-    comes first, and after it the next border is 1 / |d| further.
+    comes first, and after it the next border is 1 / |d| further. Which it is cannot be foretold, so
+    there is no branch on it.
     """
+    width = log_odds.shape[1]
+    cells, marked = log_odds.reshape(-1), marks.reshape(-1)
     for i in range(len(ends)):
-        sensor_x, sensor_y = starts[i, 0], starts[i, 1]
-        x, y = int(np.floor(sensor_x)), int(np.floor(sensor_y))
-        dx, dy = ends[i, 0] - sensor_x, ends[i, 1] - sensor_y
-        right, up = 1 if dx > 0.0 else -1, 1 if dy > 0.0 else -1
-        column = 1.0 / abs(dx) if dx != 0.0 else np.inf
-        row = 1.0 / abs(dy) if dy != 0.0 else np.inf
-        t_x = ((x + 1 - sensor_x) if dx > 0.0 else (sensor_x - x)) * column if dx != 0.0 else np.inf
-        t_y = ((y + 1 - sensor_y) if dy > 0.0 else (sensor_y - y)) * row if dy != 0.0 else np.inf
-        last_x, last_y = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
-        for _ in range(abs(last_x - x) + abs(last_y - y)):
-            if marks[y, x] != mark:
-                marks[y, x] = mark
-                log_odds[y, x] = max(log_odds[y, x] - miss, -limit) or -TINY
+        x, y = int(np.floor(starts[i, 0])), int(np.floor(starts[i, 1]))
+        dx, dy = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1]
+        columns, rows = int(np.floor(ends[i, 0])) - x, int(np.floor(ends[i, 1])) - y
+        right, up = 1 if columns > 0 else -1, width if rows > 0 else -width
+        column = 1.0 / abs(dx) if columns != 0 else 0.0
+        row = 1.0 / abs(dy) if rows != 0 else 0.0
+        t_x = ((x + 1 - starts[i, 0]) if columns > 0 else (starts[i, 0] - x)) * column
+        t_y = ((y + 1 - starts[i, 1]) if rows > 0 else (starts[i, 1] - y)) * row
+        columns, rows = abs(columns), abs(rows)
+        cell = y * width + x
+        for _ in range(columns + rows):
+            if marked[cell] != mark:
+                marked[cell] = mark
+                cells[cell] = max(cells[cell] - miss, -limit) or -TINY
             # Rounding must not lead past the last column or row.
-            if (t_x < t_y and x != last_x) or y == last_y:
-                t_x += column
-                x += right
-            else:
-                t_y += row
-                y += up
+            is_x = (t_x < t_y and columns > 0) or rows == 0
+            t_x += column if is_x else 0.0
+            t_y += 0.0 if is_x else row
+            cell += right if is_x else up
+            columns -= 1 if is_x else 0
+            rows -= 0 if is_x else 1
 
 
 def warm_up() -> None:
