@@ -25,8 +25,8 @@ class Register:
     """Cloud that is moved."""
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
     """Cloud that stays."""
-    method: Literal["gicp", "plane", "icp"] = "gicp"
-    """What is minimised: between pieces of surface, of points to planes, of points to points."""
+    method: Literal["gicp", "plane", "icp", "ndt"] = "gicp"
+    """What meets what: pieces of surface, points planes, points points, points distributions."""
     initial: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """First guess of T_target_source: 4 rows of 4 numbers; default identity."""
     voxel: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None

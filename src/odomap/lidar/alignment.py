@@ -37,6 +37,7 @@ from odomap.lidar.icp import (
     newton_step,
     pair_step,
 )
+from odomap.lidar.ndt import Distributions, add_cells, outlier_constant
 from odomap.lidar.neighbours import Grid, nearest_kernel
 
 __all__ = ["GICP", "ICP", "PLANE", "Aligned", "Stage", "align", "sum_pairs", "warm_up"]
@@ -44,11 +45,11 @@ __all__ = ["GICP", "ICP", "PLANE", "Aligned", "Stage", "align", "sum_pairs", "wa
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-ICP, PLANE, GICP = 0, 1, 2
+ICP, PLANE, GICP, NDT = 0, 1, 2, 3
 BLOCK = 1024
 FEWEST = 6
 """Pairs below which there is nothing to align."""
-MEDIANS = (2.366, 0.4549, 0.4549)
+MEDIANS = (2.366, 0.4549, 0.4549, 0.4549)
 """Median of χ² with as many degrees of freedom as a pair of each method mostly has."""
 
 
@@ -95,31 +96,42 @@ def sum_pairs(
 ) -> None:  # fmt: skip
     """Pair points p (normals m) first … last with target points q (normals n); sum in out (32,).
 
-    rows and squares: the target point of each, -1 for none, and eᵀ M e.
+    rows and squares: the target point of each, -1 for none, and eᵀ M e. For NDT q are the means of
+    cells, n their Σ⁻¹, and `width` is d₂ (`ndt`).
     """
     M = np.empty(6)
+    r00, r01, r02, r10, r11 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1]
+    r12, r20, r21, r22 = R[1, 2], R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
     for c in range(SLOTS):
         out[c] = 0.0
     for i in range((first + stride - 1) // stride * stride, last, stride):
-        x = R[0, 0] * p[i, 0] + R[0, 1] * p[i, 1] + R[0, 2] * p[i, 2]
-        y = R[1, 0] * p[i, 0] + R[1, 1] * p[i, 1] + R[1, 2] * p[i, 2]
-        z = R[2, 0] * p[i, 0] + R[2, 1] * p[i, 1] + R[2, 2] * p[i, 2]
+        x = r00 * p[i, 0] + r01 * p[i, 1] + r02 * p[i, 2]
+        y = r10 * p[i, 0] + r11 * p[i, 1] + r12 * p[i, 2]
+        z = r20 * p[i, 0] + r21 * p[i, 1] + r22 * p[i, 2]
+        if method == NDT:
+            j, s = add_cells(x, y, z, t0, t1, t2, q, n, table, size, width, out)
+            rows[i], squares[i] = j, s
+            if j >= 0:
+                out[COST] += s
+                out[COUNT] += 1.0
+            continue
         j, d2 = nearest_kernel(
-            x + t[0], y + t[1], z + t[2], q, start, stop, table, size, reach2
+            x + t0, y + t1, z + t2, q, start, stop, table, size, reach2
         )  # fmt: skip
         rows[i] = j
         if j < 0:
             continue
-        e0, e1, e2 = q[j, 0] - x - t[0], q[j, 1] - y - t[1], q[j, 2] - z - t[2]
+        e0, e1, e2 = q[j, 0] - x - t0, q[j, 1] - y - t1, q[j, 2] - z - t2
         nx, ny, nz = n[j, 0], n[j, 1], n[j, 2]
         s, g0, g1, g2 = d2, e0, e1, e2
         if method == PLANE:
             r = nx * e0 + ny * e1 + nz * e2
             s = r * r
         elif method == GICP:
-            a = R[0, 0] * m[i, 0] + R[0, 1] * m[i, 1] + R[0, 2] * m[i, 2]
-            b = R[1, 0] * m[i, 0] + R[1, 1] * m[i, 1] + R[1, 2] * m[i, 2]
-            c = R[2, 0] * m[i, 0] + R[2, 1] * m[i, 1] + R[2, 2] * m[i, 2]
+            a = r00 * m[i, 0] + r01 * m[i, 1] + r02 * m[i, 2]
+            b = r10 * m[i, 0] + r11 * m[i, 1] + r12 * m[i, 2]
+            c = r20 * m[i, 0] + r21 * m[i, 1] + r22 * m[i, 2]
             disc_metric_into(nx, ny, nz, a, b, c, M)
             g0 = M[0] * e0 + M[1] * e1 + M[2] * e2
             g1 = M[1] * e0 + M[3] * e1 + M[4] * e2
@@ -164,6 +176,14 @@ def _median(stride: int, rows: Index, squares: Array) -> float:
 
 
 @kernel
+def _motion(xi: Array, radius: float) -> float:
+    """How far a step moves the points: √(|ρ|² + r² |φ|²)."""
+    moved2 = xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2]
+    turned2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
+    return float(np.sqrt(moved2 + radius * radius * turned2))
+
+
+@kernel
 def _step(
     method: int, planar: bool, sums: Array, total: Array, radius: float, R: Array, t: Array,
     H: Array, xi: Array,
@@ -181,11 +201,11 @@ def _step(
     if method == ICP:
         if not pair_step(total, planar, R, t, xi):
             return -1.0
-        moved2 = xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2]
-        turned2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
-        return float(np.sqrt(moved2 + radius * radius * turned2))
+        return _motion(xi, radius)
     if not newton_step(total, planar, R, t, H, xi):
         return -1.0
+    if method == NDT:
+        return _motion(xi, radius)
     gain = 0.0
     for c in range(6):
         gain += xi[c] * total[21 + c]
@@ -224,7 +244,7 @@ def align(
     planar: bool,
     stages: list[Stage],
     source: tuple[Array, Array],
-    target: tuple[Grid, Array],
+    target: tuple[Grid, Array] | Distributions,
     R: Array,
     t: Array,
     loss: Loss,
@@ -233,41 +253,38 @@ def align(
     """Lay source points onto target points.
 
     Args:
-        method: ICP, PLANE or GICP.
+        method: ICP, PLANE, GICP or NDT.
         planar: whether x, y and θ alone are free.
         stages: one after the other.
         source: points (N, 3) about their mean, and normals (N, 3).
-        target: sorted points, and normals (M, 3) in the order of the grid.
+        target: sorted points, and normals (M, 3) in the order of the grid; or, for NDT, cells.
         R: (3, 3) first guess. t: (3,).
-        loss: robust loss.
+        loss: robust loss; NDT has its own.
         threads: how many share the points.
     """
-    (p, m), (grid, n) = source, target
+    p, m = source
     R, t = np.array(R), np.array(t)
-    radius = float(np.sqrt(np.mean(np.sum(p * p, axis=1)))) if len(p) else 0.0
+    radius = float(np.sqrt(3.0 * np.mean(p * p))) if len(p) else 0.0
     rows, squares = np.full(len(p), -1, np.int64), np.zeros(len(p))
     sums = np.zeros((-(-len(p) // BLOCK), SLOTS))
     table = np.array([(s.stride, s.reach, s.iterations, s.tolerance) for s in stages], np.float64)
-    arrays = p, m, R, t, grid.points, n, grid.start, grid.stop, grid.table, grid.size
     code, width = loss_code(loss)
+    surface: tuple[Any, ...]
+    if isinstance(target, Distributions):
+        none = np.empty(0, np.int64)
+        code, width = 0, outlier_constant()
+        surface = target.means, target.metrics, none, none, target.table, target.size
+    else:
+        grid, n = target
+        surface = grid.points, n, grid.start, grid.stop, grid.table, grid.size
+    arrays = p, m, R, t, *surface
     if threads > 1 and len(sums) > 1:
         steps, moved = _align_shared(
             method, planar, table, radius, arrays, code, width, rows, squares, sums, threads
         )
     else:
-        steps, moved = _align(
-            method,
-            planar,
-            table,
-            radius,
-            *arrays,
-            code,
-            width,
-            MEDIANS[method],
-            rows,
-            squares,
-            sums,
-        )
+        rest = code, width, MEDIANS[method], rows, squares, sums
+        steps, moved = _align(method, planar, table, radius, *arrays, *rest)
     return Aligned(R, t, rows, steps, 0.0 <= moved < stages[-1].tolerance)
 
 

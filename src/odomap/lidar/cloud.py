@@ -96,12 +96,14 @@ class Cloud:
         is_planar = array.shape[1] == 2
         if is_planar:
             array = np.column_stack([array, np.zeros(len(array))])
-        good = np.isfinite(array).all(axis=1)
-        if stamps is not None:
-            good &= np.isfinite(stamps)
-        num_dropped = int(len(array) - good.sum())
-        if num_dropped:
-            array, stamps = array[good], None if stamps is None else stamps[good]
+        num_dropped = 0
+        if not (np.isfinite(array).all() and (stamps is None or np.isfinite(stamps).all())):
+            good = np.isfinite(array).all(axis=1)
+            if stamps is not None:
+                good &= np.isfinite(stamps)
+                stamps = stamps[good]
+            num_dropped = int(len(array) - good.sum())
+            array = array[good]
         return cls(array, stamps, is_planar=is_planar, num_dropped=num_dropped)
 
     def __len__(self) -> int:

@@ -27,8 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.so3 import hat
+from odomap.kernels import kernel
+from odomap.lidar.icp import SLOTS, add_plane
 
-__all__ = ["Certainty", "judge"]
+__all__ = ["Certainty", "judge", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -77,22 +79,18 @@ def judge(
         planar: whether x, y and θ alone are free.
     """
     free = np.array(PLANE) if planar else np.arange(6)
-    has_normal = spreads[:, 0] > 0.0
-    r = np.where(has_normal, np.sum(n * e, axis=1), np.linalg.norm(e, axis=1))
-    error = float(np.sqrt(np.mean(r * r))) if len(r) else 0.0
-    p, r, spreads, n = p[has_normal], r[has_normal], spreads[has_normal], n[has_normal] @ R
-    own = own[has_normal]
-    if len(r) <= len(free):
+    squares, sums = np.empty(len(p)), np.zeros((4, SLOTS))
+    known = _sum_fits(p, e, n, spreads, own, R, squares, sums)
+    error = float(np.sqrt(sums[2, 10] / len(p))) if len(p) else 0.0
+    if known <= len(free):
         nothing = np.zeros((len(free), len(free)))
         return Certainty(nothing, np.eye(len(free)), error, "hardly any surface was met")
-    radius = max(float(np.sqrt(np.mean(np.sum(p * p, axis=1)))), 1e-12)
-    variance = max(_variance(r, len(free)), (EXACT * radius) ** 2)
-    across = np.concatenate([n, np.cross(p, n)], axis=1)
-    tilt = own * _tilts(spreads)
-    noise = _motion(p, tilt) - across.T @ (across * tilt[:, None]) / len(r)
-    motion = _motion(p, own) + 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
-    fits = across.T @ (across * own[:, None]) / len(r) - noise
-    noise, motion, fits = (M[np.ix_(free, free)] for M in (noise, motion, fits))
+    radius = max(float(np.sqrt(np.mean(p * p) * 3.0)), 1e-12)
+    variance = max(_variance(squares[:known], len(free)), (EXACT * radius) ** 2)
+    noise = _motion(sums[3]) - _symmetric(sums[1])
+    motion = _motion(sums[2]) + known * 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
+    fits = _symmetric(sums[0]) - noise
+    noise, motion, fits = (M[np.ix_(free, free)] / known for M in (noise, motion, fits))
     L = np.linalg.cholesky(motion)
     inverse = np.linalg.inv(L)
     shares, axes = np.linalg.eigh(inverse @ fits @ inverse.T)
@@ -104,32 +102,73 @@ def judge(
     shift = np.eye(6)
     shift[:3, 3:] = -hat(origin)
     root = shift[np.ix_(free, free)].T @ root
-    information = root @ root.T * (len(r) / variance)
+    information = root @ root.T * (known / variance)
     lever = np.where(free < 3, 1.0, radius)
     return Certainty(information, weak, error, _sentence(weak * lever, planar))
 
 
-def _motion(p: Array, w: Array) -> Array:
-    """Return (6, 6) the mean of w Jᵀ J, J = [I -p^], from the moments of the points."""
-    first, second = p.T @ w, p.T @ (p * w[:, None])
+@kernel
+def _sum_fits(
+    p: Array, e: Array, n: Array, spreads: Array, own: Array, R: Array, squares: Array, sums: Array
+) -> int:
+    """Sums of f a aᵀ (row 0), f δ² a aᵀ (1), moments f, f p, f p pᵀ of the points (2), of f δ² (3).
+
+    δ² = λ₀ λ₁ / (n (λ₁ - λ₀)²). squares: r² of pairs with a normal, whose number is returned; those
+    of all, as distances where there is no normal, are added up in sums[2, 10].
+    """
+    known = 0
+    for i in range(p.shape[0]):
+        if not spreads[i, 0] > 0.0:
+            sums[2, 10] += e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] + e[i, 2] * e[i, 2]
+            continue
+        x, y, z = p[i, 0], p[i, 1], p[i, 2]
+        a = R[0, 0] * n[i, 0] + R[1, 0] * n[i, 1] + R[2, 0] * n[i, 2]
+        b = R[0, 1] * n[i, 0] + R[1, 1] * n[i, 1] + R[2, 1] * n[i, 2]
+        c = R[0, 2] * n[i, 0] + R[1, 2] * n[i, 1] + R[2, 2] * n[i, 2]
+        r = n[i, 0] * e[i, 0] + n[i, 1] * e[i, 1] + n[i, 2] * e[i, 2]
+        squares[known] = r * r
+        known += 1
+        sums[2, 10] += r * r
+        thin, wide = spreads[i, 1], spreads[i, 2] - spreads[i, 1]
+        tilt = min(thin * spreads[i, 2] / (spreads[i, 0] * wide * wide), 1.0)
+        for row in range(2):
+            w = own[i] * tilt if row == 1 else own[i]
+            add_plane(x, y, z, a, b, c, r, w, sums[row])
+            m = sums[2 + row]
+            m[0] += w
+            m[1] += w * x
+            m[2] += w * y
+            m[3] += w * z
+            m[4] += w * x * x
+            m[5] += w * x * y
+            m[6] += w * x * z
+            m[7] += w * y * y
+            m[8] += w * y * z
+            m[9] += w * z * z
+    return known
+
+
+def _symmetric(total: Array) -> Array:
+    """Return (6, 6) of its 21 entries above the diagonal."""
+    M = np.zeros((6, 6))
+    M[np.triu_indices(6)] = total[:21]
+    return M + np.triu(M, 1).T
+
+
+def _motion(m: Array) -> Array:
+    """Return (6, 6) the sum of w Jᵀ J, J = [I -p^], from the moments of the points."""
+    second = np.array([[m[4], m[5], m[6]], [m[5], m[7], m[8]], [m[6], m[8], m[9]]])
     K = np.empty((6, 6))
-    K[:3, :3] = w.sum() * np.eye(3)
-    K[:3, 3:], K[3:, :3] = -hat(first), hat(first)
+    K[:3, :3] = m[0] * np.eye(3)
+    K[:3, 3:], K[3:, :3] = -hat(m[1:4]), hat(m[1:4])
     K[3:, 3:] = np.trace(second) * np.eye(3) - second
-    return np.asarray(K / len(p))
+    return K
 
 
-def _variance(r: Array, used: int) -> float:
-    """Return σ² of residuals (N,), a part of which may be gross."""
-    r2 = r * r
-    kept = r2[r2 <= GROSS * float(np.median(r2)) / MEDIAN_OF_CHI2]
+def _variance(squares: Array, used: int) -> float:
+    """Return σ² of squared residuals (N,), a part of which may be gross."""
+    kept = squares[squares <= GROSS * float(np.median(squares)) / MEDIAN_OF_CHI2]
     return float(kept.sum() / max(len(kept) - used, 1))
-
-
-def _tilts(spreads: Array) -> Array:
-    """Return (N,) variances of normals, rad²: λ₀ λ₁ / (n (λ₁ - λ₀)²)."""
-    n, least, middle = spreads[:, 0], spreads[:, 1], spreads[:, 2]
-    return np.asarray(np.minimum(least * middle / (n * (middle - least) ** 2), 1.0))
 
 
 def _parted(weak: Array, turns: int) -> Array:
@@ -161,3 +200,9 @@ def _axis(vector: Array) -> str:
     unit = vector / np.linalg.norm(vector)
     unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
     return "(" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in unit.tolist()) + ")"
+
+
+def warm_up() -> None:
+    """Compile the kernels of this file."""
+    p, one = np.eye(3), np.ones((3, 5))
+    judge(p, p, p, one, np.ones(3), p, np.zeros(3), False)

@@ -161,6 +161,7 @@ def k_nearest_kernel(
         fx, fy, fz = x - ci * size, y - cj * size, z - ck * size
         gap = min(min(fx, size - fx), min(min(fy, size - fy), min(fz, size - fz)))
         count, bound, done[q] = 0, limit2, False
+        mine, far = rows[q], squares[q]
         for shell in range(SHELLS + 1):
             for i in range(-shell, shell + 1):
                 ex = max(max(i * size - fx, fx - (i + 1) * size), 0.0)
@@ -181,15 +182,15 @@ def k_nearest_kernel(
                             u, v, w = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
                             d2 = u * u + v * v + w * w
                             if d2 < bound:
-                                count = _insert(d2, n, k, count, rows[q], squares[q])
-                                bound = squares[q, k - 1] if count == k else limit2
+                                count = _insert(d2, n, k, count, mine, far)
+                                bound = far[k - 1] if count == k else limit2
             reached = shell * size + gap
             if reached * reached >= bound:
                 done[q] = True
                 found += 1
                 break
         for n in range(count, k):
-            rows[q, n], squares[q, n] = -1, np.inf
+            mine[n], far[n] = -1, np.inf
     return found
 
 
@@ -220,7 +221,7 @@ def k_nearest(
     origin = y.mean(axis=0)
     x, y = x - origin, y - origin
     left, extent = np.arange(len(x)), float(max(np.abs(x).max(), np.abs(y).max()))
-    size = max(size or typical_cell(y), 8.0 * extent / FURTHEST) or 1.0
+    size = max(size or np.sqrt(min(k, len(y))) * typical_cell(y), 8.0 * extent / FURTHEST) or 1.0
     while len(left):  # those with too few points around them again, in larger cells
         grid = Grid.of(y, size)
         arrays = grid.points, grid.start, grid.stop, grid.table, size

@@ -30,9 +30,10 @@ from numpy.typing import ArrayLike, NDArray
 from odomap.errors import ConfigError, InputError, nearest_name
 from odomap.geometry.pose import SE2, SE3
 from odomap.geometry.robust import Loss
-from odomap.lidar.alignment import GICP, ICP, PLANE, Aligned, Stage, align
+from odomap.lidar.alignment import GICP, ICP, NDT, PLANE, Aligned, Stage, align
 from odomap.lidar.cloud import Cloud, HasPoints, cloud_of
 from odomap.lidar.degeneracy import judge
+from odomap.lidar.ndt import distributions
 from odomap.lidar.target import FEWEST, Sampled, Target, check_enough, sample, suitable_voxel
 from odomap.limits import Count, check_limits
 
@@ -40,8 +41,10 @@ __all__ = ["METHODS", "Method", "Registration", "RegistrationConfig", "register"
 
 Array = NDArray[np.float64]
 
-Method = Literal["gicp", "plane", "icp"]
-METHODS = ("icp", "plane", "gicp")
+Method = Literal["gicp", "plane", "icp", "ndt"]
+METHODS = ("icp", "plane", "gicp", "ndt")
+CELLS = (8.0, 4.0)
+"""Sides of the cells of NDT, in voxels, one after the other."""
 COARSE_POINTS = 500
 """Least points of the first, sparse look."""
 
@@ -51,7 +54,7 @@ class RegistrationConfig:
     """How clouds are laid onto each other."""
 
     method: Method = "gicp"
-    """What is minimised: gicp, plane, icp."""
+    """What is minimised: gicp, plane, icp, ndt."""
     voxel: float | None = None
     """Side of the voxels both are down-sampled to, metres; 0: not at all; None: what suits the
     target, a twentieth of its mean distance from its middle."""
@@ -63,7 +66,7 @@ class RegistrationConfig:
     iterations: Count = 60
     """Most steps with all points."""
     tolerance: float | None = None
-    """Root mean square motion of the points below which it is over, metres; None: voxel / 2000."""
+    """Root mean square motion of the points below which it is over, metres; None: voxel / 1000."""
     neighbours: Count = 10
     """Points that tell a normal where voxels do not."""
     threads: Count = 1
@@ -148,7 +151,7 @@ def register(
         source: (N, 3) or (N, 2) points, a cloud, or anything with points; NaN rows are dropped; or
             what `sample` made of it before.
         target: as the source; or a `Target` made of it before.
-        method: "gicp", "plane" or "icp"; default that of the config.
+        method: "gicp", "plane", "icp" or "ndt"; default that of the config.
         initial: first guess of T_target_source, (4, 4), or (3, 3) in the plane; default identity.
         max_distance: overrides that of the config, as do voxel, loss and threads.
         voxel: side of voxels, metres.
@@ -170,18 +173,15 @@ def register(
     config = _settings(config, method, max_distance, voxel, loss, threads)
     sampled, target = _prepared(source, target, config)
     R, t = _centred(_first_guess(initial, target.is_planar), sampled.origin, target.origin)
-    code = {"icp": ICP, "plane": PLANE, "gicp": GICP}[config.method]
-    aligned = align(
-        code,
-        target.is_planar,
-        _stages(config, target, len(sampled)),
-        (sampled.points, sampled.discs() if code == GICP else sampled.normals),
-        (target.grid, target.discs if code == GICP else target.normals),
-        R,
-        t,
-        config.loss,
-        config.threads,
-    )
+    stages = _stages(config, target, len(sampled))
+    if config.method == "ndt":
+        aligned = _align_cells(config, sampled, target, stages, R, t)
+    else:
+        code = {"icp": ICP, "plane": PLANE, "gicp": GICP}[config.method]
+        pieces = sampled.points, sampled.discs() if code == GICP else sampled.normals
+        surface = target.grid, target.discs if code == GICP else target.normals
+        rest = R, t, config.loss, config.threads
+        aligned = align(code, target.is_planar, stages, pieces, surface, *rest)
     return _concluded(sampled, target, aligned)
 
 
@@ -271,7 +271,7 @@ def _stages(config: RegistrationConfig, target: Target, count: int) -> list[Stag
     counterpart, and would turn the cloud by what the other one does not see.
     """
     reach = target.reach if config.max_distance is None else config.max_distance
-    tolerance = target.spacing / 2000.0 if config.tolerance is None else config.tolerance
+    tolerance = target.spacing / 1000.0 if config.tolerance is None else config.tolerance
     stages = [Stage(1, 0.5 * reach, config.iterations, tolerance)]
     for stride, share in ((2, 1.0), (8, 2.0)):
         if count < stride * COARSE_POINTS:
@@ -279,6 +279,27 @@ def _stages(config: RegistrationConfig, target: Target, count: int) -> list[Stag
         coarse = max(tolerance, 0.01 * share * target.spacing)
         stages.insert(0, Stage(stride, share * reach, config.iterations, coarse))
     return stages
+
+
+def _align_cells(
+    config: RegistrationConfig,
+    source: Sampled,
+    target: Target,
+    stages: list[Stage],
+    R: Array,
+    t: Array,
+) -> Aligned:
+    """Align by NDT in ever smaller cells; then pair points, for what is said about the result."""
+    pieces, planar = (source.points, source.normals), target.is_planar
+    iterations, converged = 0, True
+    for side, stage in zip(CELLS, stages[-2:], strict=True):
+        cells = distributions(target.grid.points, side * target.spacing, planar)
+        found = align(NDT, planar, [stage], pieces, cells, R, t, Loss(), config.threads)
+        R, t, converged = found.R, found.t, found.converged
+        iterations += found.iterations
+    once = [replace(stages[-1], iterations=1)]
+    paired = align(PLANE, planar, once, pieces, (target.grid, target.normals), R, t, Loss())
+    return Aligned(R, t, paired.rows, iterations, converged)
 
 
 def _concluded(source: Sampled, target: Target, aligned: Aligned) -> Registration:

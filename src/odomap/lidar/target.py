@@ -29,7 +29,7 @@ from odomap.lidar.cloud import Cloud, HasPoints, cloud_of
 from odomap.lidar.gicp import discs
 from odomap.lidar.neighbours import Grid, typical_cell
 from odomap.lidar.normals import cell_covariances, nearest_covariances, normals_of
-from odomap.lidar.voxels import into_cells, mean_points
+from odomap.lidar.voxels import centred, into_cells, mean_points
 
 __all__ = ["FEWEST", "Sampled", "Target", "check_enough", "sample", "suitable_voxel"]
 
@@ -139,9 +139,8 @@ def sample(cloud: Cloud, voxel: float | None, neighbours: int, name: str) -> Sam
         InputError: hardly any points, or all in one place.
     """
     check_enough(len(cloud), cloud, name)
-    origin = cloud.points.mean(axis=0)
-    raw = cloud.points - origin
-    if not raw.any():
+    origin, raw, furthest = centred(cloud.points)
+    if not furthest > 0.0:
         raise InputError(f"{name}: all {len(cloud)} points are in one place")
     size = suitable_voxel(cloud) if voxel is None else voxel
     if not (np.isfinite(size) and size >= 0.0):

@@ -31,6 +31,7 @@ __all__ = [
     "FURTHEST",
     "Cells",
     "axis_of_key",
+    "centred",
     "into_cells",
     "key_of",
     "mean_points",
@@ -159,6 +160,27 @@ def mean_points(keys: Index, sums: Array, size: float, means: Array) -> None:
             means[cell, axis] = centre + sums[cell, 1 + axis] / sums[cell, 0]
 
 
+@kernel
+def _centre_kernel(points: Array, mean: Array, out: Array) -> float:
+    """mean = Σ p / N, out = p - mean; returns the largest |coordinate| of out."""
+    count = points.shape[0]
+    x, y, z, furthest = 0.0, 0.0, 0.0, 0.0
+    for n in range(count):
+        x, y, z = x + points[n, 0], y + points[n, 1], z + points[n, 2]
+    mean[0], mean[1], mean[2] = x / count, y / count, z / count
+    for n in range(count):
+        for axis in range(3):
+            out[n, axis] = points[n, axis] - mean[axis]
+            furthest = max(furthest, abs(out[n, axis]))
+    return furthest
+
+
+def centred(points: Array) -> tuple[Array, Array, float]:
+    """Return the mean (3,) of some points (N, 3), them about it, and their largest coordinate."""
+    mean, out = np.empty(3), np.empty((len(points), 3))
+    return mean, out, float(_centre_kernel(np.ascontiguousarray(points), mean, out))
+
+
 def into_cells(points: Array, size: float) -> Cells:
     """Sort points into cells.
 
@@ -193,7 +215,7 @@ def into_cells(points: Array, size: float) -> Cells:
 
 def warm_up() -> None:
     """Compile the kernels of this file."""
-    points = np.zeros((1, 3))
+    points = centred(np.zeros((1, 3)))[1]
     cells = into_cells(points, 1.0)
     rehash_kernel(cells.keys, 1, new_table(1))
     mean_points(cells.keys, cells.sums, 1.0, points)
