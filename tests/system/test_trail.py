@@ -27,22 +27,23 @@ def view(n):
 def test_the_newest_frames_are_kept_without_their_images():
     trail = Trail()
     for n in range(LENGTH + 5):
-        trail.add(n, view(n), np.arange(n), 0)
-    kept = list(trail.overtaken(1))
+        trail.add(n, view(n), np.arange(n))
+    kept = list(trail.not_at_rest(1))
     assert [f.place for f in kept] == list(range(5, LENGTH + 5))
     assert all(f.view.image.shape == (16, 16) for f in kept)
 
 
 def test_a_frame_is_given_once_for_each_state_of_the_map():
     trail = Trail()
-    trail.add(0, view(0), np.arange(3), 4)
-    trail.add(1, view(1), np.arange(3), 5)
-    assert [f.place for f in trail.overtaken(5)] == [0]
-    assert not list(trail.overtaken(5))
-    assert [f.place for f in trail.overtaken(6)] == [0, 1]
+    trail.add(0, view(0), np.arange(3))
+    assert [f.place for f in trail.not_at_rest(5)] == [0]
+    trail.add(1, view(1), np.arange(3))
+    assert [f.place for f in trail.not_at_rest(5)] == [1]
+    assert not list(trail.not_at_rest(5))
+    assert [f.place for f in trail.not_at_rest(6)] == [0, 1]
     trail.forget()
     assert len(trail) == 0
-    assert not list(trail.overtaken(7))
+    assert not list(trail.not_at_rest(7))
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +73,8 @@ def change(slam):
 def test_frames_since_the_last_keyframe_are_placed_again_when_the_map_has_changed(world):
     slam, estimates, last = misplaced(world, list(world))
     assert 0 < last < len(estimates) - 1
-    # What no keyframe came after may have been overtaken by mapping already: not any more.
-    list(slam._tracker._trail.overtaken(slam.map.epoch))
+    # Let it be as if they had been placed at rest, wrongly, in the map as it is.
+    list(slam._tracker._trail.not_at_rest(slam.map.epoch))
     before = slam._tracker.path.trajectory()
     still = slam.finish().trajectory
     np.testing.assert_array_equal(still.Ts_world_body, before.Ts_world_body)
@@ -91,7 +92,7 @@ def test_frames_since_the_last_keyframe_are_placed_again_when_the_map_has_change
 def test_what_cannot_be_placed_again_stays_where_it_hangs(world):
     slam, _, last = misplaced(world, list(world))
     trail = slam._tracker._trail
-    kept = list(trail.overtaken(-1))
+    kept = list(trail.not_at_rest(-1))
     trail.forget()
     nothing = np.zeros(0, np.int64)
     for frame in kept:

@@ -221,7 +221,7 @@ class MapTracker(Tracker[LocalMap]):
             self._expected_often.append(known.landmark_ids[located.expected_rows])
             self._seen_often.append(shown)
             if not self._veil.is_shown:
-                self._trail.add(len(self.path) - 1, look.view, shown, self._map.epoch)
+                self._trail.add(len(self.path) - 1, look.view, shown)
             sharing, _ = self._map.observing(shown)
             if len(sharing) and sharing[0] != known.keyframe_id:
                 self._turn_later(int(sharing[0]), located.T_world_body)
@@ -232,7 +232,7 @@ class MapTracker(Tracker[LocalMap]):
 
         One that cannot be found where it hangs stays there.
         """
-        for frame in self._trail.overtaken(self._map.epoch):
+        for frame in self._trail.not_at_rest(self._map.epoch):
             before, view = self.path[frame.place], frame.view
             T_world_body = self._map.place(before.keyframe_id, before.T_keyframe_body)
             known = self._around(before.keyframe_id, T_world_body)

@@ -6,7 +6,8 @@ apart until mapping and adjustment have brought them together, and a frame place
 both is off from either. A keyframe is adjusted with the rest. The frames before the next one hang
 as they are, which hardly shows in the middle of a path; but the last of them is its end, and where
 the body is now. So of those since the last keyframe is kept what they show, and when a run ends
-they are placed again, in the map as it has become:
+they are placed again, in the map as it has become, with what is around where they were found rather
+than where they were expected:
 
     T_keyframe_frame ← argmin over T of Σ ρ(|x - π(T⁻¹ p)|²),    p as known now.
 
@@ -41,13 +42,13 @@ class Trailing:
         place: its place among the frames of the path.
         view: its features, without the image but for the coarsest level of its pyramid.
         landmark_ids: (n,) what it showed of the map.
-        epoch: of the map in which it was placed.
+        rested: epoch of the map in which it was placed at rest; -1 if in none yet.
     """
 
     place: int
     view: View
     landmark_ids: Index
-    epoch: int
+    rested: int = -1
 
 
 class Trail:
@@ -59,22 +60,22 @@ class Trail:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, place: int, view: View, landmark_ids: Index, epoch: int) -> None:
+    def add(self, place: int, view: View, landmark_ids: Index) -> None:
         """Keep a frame that was placed."""
         light = replace(view, pyramid=view.pyramid[-1:])
-        self._frames.append(Trailing(place, light, landmark_ids, epoch))
+        self._frames.append(Trailing(place, light, landmark_ids))
 
     def forget(self) -> None:
         """Begin anew: a keyframe was made."""
         self._frames.clear()
 
-    def overtaken(self, epoch: int) -> Iterator[Trailing]:
-        """Yield the frames since whose placement the map has changed; each is given once.
+    def not_at_rest(self, epoch: int) -> Iterator[Trailing]:
+        """Yield the frames that were not placed at rest in the map as it is; each is given once.
 
         Args:
             epoch: of the map as it is now.
         """
         for n, frame in enumerate(self._frames):
-            if frame.epoch != epoch:
-                self._frames[n] = replace(frame, epoch=epoch)
+            if frame.rested != epoch:
+                self._frames[n] = replace(frame, rested=epoch)
                 yield frame
