@@ -100,6 +100,7 @@ def export_grid(
         raise InputError(f"{target}: give a name that ends in .yaml")
     tell = progress or (lambda done, total, text: None)
     place, notes = Path(run), list[str]()
+    _warm_up(tell)
     saved = place / FILE if place.is_dir() else place
     made = _of_map(saved, rig, config) if saved.exists() or not place.is_dir() else None
     if made is None:

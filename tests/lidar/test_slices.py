@@ -96,28 +96,42 @@ def room(rng, floor_share=0.15):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_floor_is_found_however_the_world_is_turned(seed):
+@pytest.mark.parametrize("tilt_deg", [17.0, 40.0])
+def test_the_floor_is_found_however_the_world_is_turned(seed, tilt_deg):
     rng = np.random.default_rng(seed)
     points, eyes = room(rng), rng.uniform([-1, -1, 0.8], [1, 1, 1.6], (5, 3))
-    axis = rng.standard_normal(3)
+    axis, around = rng.standard_normal(3), rng.uniform(0, 2 * np.pi)
     up = axis / np.linalg.norm(axis)
     T = np.linalg.inv(level(up, 0.7))
-    tilt = level(np.array([np.sin(0.3), 0.0, np.cos(0.3)]))[:3, :3]
-    guess = T[:3, :3] @ tilt @ [0.0, 0.0, 1.0]  # 17 degrees off
+    off = np.deg2rad(tilt_deg)
+    tilted = [np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)]
     moved, seen_from = (p @ T[:3, :3].T + T[:3, 3] for p in (points, eyes))
-    n, height = find_floor(moved, seen_from, guess)
+    n, height = find_floor(moved, seen_from, T[:3, :3] @ tilted)
     assert np.degrees(np.arccos(min(n @ up, 1.0))) < 0.5
     assert height == pytest.approx(0.7, abs=0.02)
 
 
+def test_a_floor_of_which_little_is_seen_is_found_below_a_table():
+    rng = np.random.default_rng(1)
+    table = rng.uniform([0, 0, 0.75], [1.5, 1, 0.75], (5000, 3))
+    floor = rng.uniform([-1, -1, 0], [0, 1, 0], (200, 3))
+    points = np.concatenate([table, floor]) + 0.005 * rng.standard_normal((5200, 3))
+    n, height = find_floor(points, np.array([[0.5, -1, 1.4]]), np.array([0.0, 0.5, 0.75**0.5]))
+    assert n[2] > np.cos(np.deg2rad(0.5))
+    assert height == pytest.approx(0.0, abs=0.02)
+
+
 def test_where_no_floor_is_seen_none_is_found():
-    rng = np.random.default_rng(0)
+    rng, z, eyes = np.random.default_rng(0), np.array([0, 0, 1.0]), np.array([[0, 0, 1.0]])
     wall = rng.uniform([3, -2, 0], [3, 2, 2.5], (3000, 3)) + 0.01 * rng.standard_normal((3000, 3))
-    assert find_floor(wall, np.array([[0, 0, 1.0]]), np.array([0, 0, 1.0])) is None
-    assert find_floor(wall[:2], np.array([[0, 0, 1.0]]), np.array([0, 0, 1.0])) is None
-    points = room(rng, floor_share=0.0)
-    table = find_floor(points, np.array([[0, 0, 1.0]]), np.array([0, 0, 1.0]))
-    assert table is None  # a table has much below it
+    line = np.linspace([3, -1, 0], [3, 1, 2], 500)
+    for points in (wall, wall[:2], line, np.zeros((100, 3))):
+        n, height = find_floor(points, eyes, z)
+        assert height is None
+        np.testing.assert_array_equal(n, z)
+    n, height = find_floor(room(rng, floor_share=0.0), eyes, z)
+    assert height is None  # a table has much below it
+    assert n[2] > 0.9999  # but it, and the ceiling, are level
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -0.6, 0.8]])

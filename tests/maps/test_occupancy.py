@@ -83,7 +83,7 @@ def test_no_return_is_free_only_where_that_is_asked_for():
 def test_a_grid_of_sweeps_shows_what_stands_between_two_heights(sweeps):
     made = grid_of_map(sweeps, recorded(SWEEPS).rig)
     assert made.made_of == "clouds"
-    assert made.notes == ("the floor is 1.39 m below the sensor",)
+    assert made.notes == ("the floor is 1.39 m below the sensor, by what was seen",)
     true = gridworlds.surfaces(SWEEPS, 0.1, 1.8)
     centres = occupied(made.grid)
     away = gridworlds.distances(centres, true)
@@ -99,11 +99,12 @@ def test_a_grid_of_sweeps_shows_what_stands_between_two_heights(sweeps):
 
 def test_heights_may_be_counted_along_the_body(sweeps):
     rig = recorded(SWEEPS).rig
-    made = grid_of_map(sweeps, rig, GridConfig(up="body", floor=-1.4))
+    made = grid_of_map(sweeps, rig, GridConfig(up="body", floor=1.4))
     away = gridworlds.distances(occupied(made.grid), gridworlds.surfaces(SWEEPS, 0.0, 1.9))
     assert np.mean(away < 0.05) > 0.85  # the body sways, and its floor with it
-    given = grid_of_map(sweeps, rig, GridConfig(floor=0.0))
+    given = grid_of_map(sweeps, rig, GridConfig(floor=1.39))
     found = grid_of_map(sweeps, rig)
+    assert not given.notes
     assert len(occupied(given.grid)) == pytest.approx(len(occupied(found.grid)), rel=0.05)
 
 

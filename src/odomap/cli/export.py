@@ -42,6 +42,8 @@ class Export:
     """Size of the grid's cells."""
     height: Annotated[tuple[float, float], tyro.conf.arg(metavar="LOW HIGH")] = (0.1, 1.8)
     """What is in the way, metres above the floor; of clouds and depth."""
+    floor: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """How far the floor is below the sensor; default by what was seen."""
     up: Literal["gravity", "body"] = "gravity"
     """What heights are counted along: body for what drives on wheels, up ramps, too."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -90,7 +92,7 @@ class Export:
         from odomap.maps.occupancy import GridConfig
 
         band = SliceConfig(low=self.height[0], high=self.height[1])
-        config = GridConfig(resolution=self.resolution, slice=band, up=self.up)
+        config = GridConfig(resolution=self.resolution, slice=band, up=self.up, floor=self.floor)
         with Steps("export", self.quiet) as steps:
             result = export_grid(
                 self.run,

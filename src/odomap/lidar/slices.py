@@ -11,10 +11,11 @@ into the band to where they leave it or end, and not beyond its nearest hit: wha
 low thing may hang over it. So a table is occupied where its top is in the band, though its floor is
 seen; something that lies below all beams is passed over; and of holes nothing is said.
 
-The floor, where it is not known, is a plane found by random sampling: near a guess of upwards,
-below the eyes, hardly anything below it, and of those the one with most points.
+Where the floor is not known, a plane of any height says what is level: around points planes are
+fitted, those 50° off a guess of upwards at most tried, and the one taken on which most points lie,
+times cos² of that angle. The floor is the lowest height at which many lie and hardly any below.
 
-Cost: O(points); finding the floor O(samples · trials), some 10 ms.
+Cost: O(points); finding the floor O(samples · trials), some 50 ms.
 
 Reference: M. Fischler, R. Bolles, "Random sample consensus", Comm. ACM 24(6), 1981; A. Hornung et
 al., "OctoMap", Autonomous Robots 34, 2013 (maps projected to the floor).
@@ -33,19 +34,21 @@ __all__ = ["Slice", "SliceConfig", "find_floor", "level", "slice_sweep"]
 
 Array = NDArray[np.float64]
 
-TRIALS, SAMPLES = 1000, 5000
-LOWER = 0.35
-"""Part of the points, the lowest by the guess, of which planes are made."""
+TRIALS, SAMPLES, AROUND = 500, 5000, 16
+"""Planes tried at most, points looked at, and points to which one is fitted."""
 ON_FLOOR_M = 0.15
 """How high, or low, a point of the floor may be: floors are not planes."""
 NEAR_M = 0.04
-"""How far a point of the floor may be off the plane."""
+"""How far a point of a plane may be off it."""
+THIN, LONG = 0.1, 0.02
+"""Variance of points across their plane at most, and of the lesser one along it at least, over the
+next larger one: what is no plane, and what is a line."""
+GUESS = np.cos(np.deg2rad(50.0))
+"""How far off upwards may be guessed: heads and hands tilt cameras."""
 BELOW_M, BELOW_SHARE = 0.15, 0.03
 """Hardly anything is lower than this below the floor: walls of glass and polished floors mirror."""
-FLAT = np.cos(np.deg2rad(35.0))
-"""How far the floor may be off level, by the guess of upwards."""
-LEAST_SHARE = 0.03
-"""Of all points that must be on it."""
+LEVEL_SHARE, FLOOR_SHARE = 0.03, 0.01
+"""Of all points that must be on a plane that says what is level, and on the floor."""
 
 
 @dataclass(frozen=True)
@@ -126,39 +129,63 @@ def level(up: Array, height: float = 0.0) -> Array:
     return T
 
 
-def find_floor(points: Array, eyes: Array, up: Array, seed: int = 0) -> tuple[Array, float] | None:
+def find_floor(points: Array, eyes: Array, up: Array, seed: int = 0) -> tuple[Array, float | None]:
     """Find the plane that a sensor moves over.
 
     Args:
         points: (N, 3) what was seen, metres.
         eyes: (K, 3) from where.
-        up: (3,) of unit length, 35° off at most.
+        up: (3,) of unit length, 50° off at most.
         seed: of the samples.
 
     Returns:
-        (3,) upwards from the floor, and its height along it; None where no plane is found.
+        (3,) upwards, as guessed where nothing level is seen, and the floor's height along it; None
+        where it is not seen.
     """
     rng = np.random.default_rng(seed)
     if len(points) > SAMPLES:
         points = points[np.sort(rng.choice(len(points), SAMPLES, replace=False))]
-    if len(points) < 3:
-        return None
-    lower = points[points @ up <= np.quantile(points @ up, LOWER)]
-    a, b, c = np.moveaxis(lower[rng.integers(0, len(lower), (TRIALS, 3))], 1, 0)
-    normals = np.cross(b - a, c - a)
-    length = np.linalg.norm(normals, axis=1)
-    normals = normals[length > 1e-9] / length[length > 1e-9, None]
-    a = a[length > 1e-9]
-    normals *= np.where(normals @ up < 0.0, -1.0, 1.0)[:, None]
-    heights = np.einsum("nk,nk->n", normals, a)
-    best, found = LEAST_SHARE * len(points), None
-    for n, h in zip(normals[normals @ up > FLAT], heights[normals @ up > FLAT]):
-        above = points @ n - h
-        on = np.abs(above) < NEAR_M
-        is_lowest = np.mean(above < -BELOW_M) < BELOW_SHARE and np.mean(eyes @ n > h) > 0.9
-        if on.sum() > best and is_lowest:
-            best, found = int(on.sum()), on
-    return None if found is None else _plane(points, found, up)
+    n = _find_level(points, up, rng) if len(points) > AROUND else None
+    if n is None:
+        return up, None
+    heights, count = points @ n, len(points)
+    edges = np.arange(heights.min() - 2 * NEAR_M, heights.max() + 3 * NEAR_M, NEAR_M)
+    within = np.convolve(np.histogram(heights, edges)[0], [1, 1, 1], "same")  # a bin to either side
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    far = round(BELOW_M / NEAR_M)
+    for k in range(1, len(within) - 1):
+        above = np.median(within[k + far : k + 4 * far]) if k + far < len(within) else 0.0
+        is_peak = within[k] == within[max(k - far, 0) : k + far].max() and within[k] > 2.0 * above
+        if not is_peak or within[k] < FLOOR_SHARE * count:
+            continue
+        h, on = middles[k], np.abs(heights - middles[k]) < 1.5 * NEAR_M
+        if np.mean(heights < h - BELOW_M) > BELOW_SHARE or np.mean(eyes @ n > h) < 0.9:
+            break
+        # A floor of which much is seen says itself what is level.
+        return _plane(points, on, n) if on.mean() > LEVEL_SHARE else (n, float(heights[on].mean()))
+    return n, None
+
+
+def _find_level(points: Array, up: Array, rng: np.random.Generator) -> Array | None:
+    """Return the normal of the plane that is level, whatever its height."""
+    from scipy.spatial import cKDTree
+
+    near = np.asarray(cKDTree(points).query(points, AROUND)[1])
+    offsets = points[near] - points[near].mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    normals = axes[:, :, 0] * np.where(axes[:, :, 0] @ up < 0.0, -1.0, 1.0)[:, None]
+    lesser, middle, larger = variances.T
+    good = (lesser < THIN * middle) & (middle > LONG * larger) & (normals @ up > GUESS)
+    tried = np.flatnonzero(good)
+    if len(tried) > TRIALS:
+        tried = np.sort(rng.choice(tried, TRIALS, replace=False))
+    best, found = 0.0, None
+    for i in tried:
+        on = np.abs((points - points[near[i]].mean(axis=0)) @ normals[i]) < NEAR_M
+        score = on.sum() * float(normals[i] @ up) ** 2
+        if score > best and on.mean() > LEVEL_SHARE:
+            best, found = score, on
+    return None if found is None else _plane(points, found, up)[0]
 
 
 def _plane(points: Array, on: NDArray[np.bool_], up: Array) -> tuple[Array, float]:

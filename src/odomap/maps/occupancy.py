@@ -70,8 +70,8 @@ class GridConfig:
     up: str = "gravity"
     """What heights are counted along: "gravity" or "body"."""
     floor: float | None = None
-    """Height of the floor along that, metres from the origin of the world or of the body; None
-    looks for it in the points."""
+    """How far it is below the sensor, in the middle of all, metres; None looks for it in the points
+    seen. To be given where a table is seen and the floor under it is not."""
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -284,17 +284,14 @@ def _find_ground(
         eyes.append(T[:3, :3] @ s.eye_body + T[:3, 3])
     up = up_body if of_body else up_world
     seen, notes = np.concatenate(points), list[str]()
-    found = None if config.floor is not None else find_floor(seen, np.array(eyes), up)
+    up, found = find_floor(seen, np.array(eyes), up)
+    height = float(np.quantile(seen @ up, LOWEST)) if found is None else found
+    eye = float(np.median(np.array(eyes) @ up))
     if config.floor is not None:
-        height = config.floor
-        up = np.array([0.0, 0.0, 1.0]) if not of_body and up[2] > LEVEL else up
+        height = eye - config.floor
     elif found is not None:
-        up, height = found
-        notes.append(
-            f"the floor is {np.median(np.array(eyes) @ up - height):.2f} m below the sensor"
-        )
+        notes.append(f"the floor is {eye - height:.2f} m below the sensor, by what was seen")
     else:
-        height = float(np.quantile(seen @ up, LOWEST))
         notes.append("no floor was seen: heights are counted from the lowest points")
     plane = up_world if of_body else up
     plane = np.array([0.0, 0.0, 1.0]) if plane[2] > LEVEL else plane
