@@ -122,6 +122,17 @@ def export_grid(
     return GridExport(made, tuple(written), (*notes, *made.notes))
 
 
+def _warm_up(tell: Progress) -> None:
+    """Compile, or load, what grids need."""
+    from odomap.compiling import compile_modules
+
+    names = ("lidar.grid", "lidar.scans", "lidar.slices", "maps.tsdf_depth")
+    compile_modules(
+        [f"odomap.{name}" for name in names],
+        lambda done, total, name: tell(done, total, f"compiling {name}"),
+    )
+
+
 def _of_map(file: Path, rig: "Rig | str | Path | None", config: "GridConfig") -> "GridMap | None":
     """Return a grid of a map's scans or clouds; None where it has none."""
     from odomap.maps.occupancy import grid_of_map
