@@ -68,6 +68,12 @@ def test_a_first_guess_from_a_file(folder, cli):
     assert "4 rows of 4" in err
 
 
+def test_without_a_first_guess(folder, cli):
+    code, out, _ = cli("far.ply", "target.ply", "--initial", "global")
+    assert code == 0
+    assert "converged" in out
+
+
 def test_what_does_not_meet_is_said(folder, cli):
     code, _, err = cli("far.ply", "target.ply")
     assert code == 1

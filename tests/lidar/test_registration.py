@@ -7,7 +7,7 @@ import odomap
 from lidarworlds import CORRIDOR, CORRIDOR_2D, PLANE, ROOM, ROOM_2D, Sphere
 from odomap.errors import ConfigError, InputError
 from odomap.geometry.lie import se2_exp, se2_log, se3_exp, se3_inverse, se3_log
-from odomap.lidar.registration import METHODS, RegistrationConfig
+from odomap.lidar.methods import METHODS, RegistrationConfig
 from odomap.lidar.target import Target
 
 TRUTH = se3_exp(np.array([0.2, -0.1, 0.05, 0.03, -0.02, 0.08]))

@@ -27,8 +27,9 @@ class Register:
     """Cloud that stays."""
     method: Literal["gicp", "plane", "icp", "ndt"] = "gicp"
     """What meets what: pieces of surface, points planes, points points, points distributions."""
-    initial: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """First guess of T_target_source: 4 rows of 4 numbers; default identity."""
+    initial: Annotated[Path | None, tyro.conf.arg(metavar="FILE|global")] = None
+    """First guess of T_target_source: 4 rows of 4 numbers; or global, which needs none; default
+    identity."""
     voxel: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Side of the voxels both are down-sampled to; 0: not at all; default what suits the target."""
     max_distance: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
@@ -51,7 +52,7 @@ class Register:
             source,
             target,
             self.method,
-            initial=None if self.initial is None else read_motion(self.initial),
+            initial=first_guess(self.initial),
             voxel=self.voxel,
             max_distance=self.max_distance,
             loss=self.loss,
@@ -70,6 +71,13 @@ class Register:
         if not found.converged:
             print(f"odomap: not converged: {found.reason}", file=sys.stderr)
         return 0 if found.converged else 1
+
+
+def first_guess(given: Path | None) -> "list[list[float]] | Literal['global'] | None":
+    """Return what `register` takes: a motion, the word "global", or nothing."""
+    if given is None:
+        return None
+    return "global" if str(given) == "global" else read_motion(given)
 
 
 def read_motion(path: Path) -> list[list[float]]:

@@ -6,12 +6,8 @@
     found.T_target_source, found.information, found.reason
 
 All methods share a loop (`alignment`): pair each source point with the nearest of the target within
-reach, move so that pairs come together, until nothing moves. They differ in what "together" means:
-
-    icp      points meet points              knows no surfaces; slow, but needs no normals
-    plane    points meet the target's tangent planes (lines in 2D)
-    gicp     pieces of surface meet          the most exact, from the widest starts; the default
-    ndt      points meet normal distributions, one per cell, without pairs
+reach, move so that pairs come together, until nothing moves. What "together" means makes the method
+(`methods`); what is said of the result is the same for all (`degeneracy`).
 
 2D clouds are 3D ones at z = 0 of which only x, y and θ move. The search begins at a first guess:
 identity, what a motion model says, or "global", which needs none (`globalalign`).
@@ -21,70 +17,28 @@ mobile robotics", Foundations and Trends in Robotics 4(1), 2015.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from odomap.errors import ConfigError, InputError, nearest_name
+from odomap.errors import InputError
 from odomap.geometry.pose import SE2, SE3
 from odomap.geometry.robust import Loss
-from odomap.lidar.alignment import GICP, ICP, NDT, PLANE, Aligned, Stage, align
+from odomap.geometry.so3 import so3_log
+from odomap.lidar.alignment import Aligned, Stage
 from odomap.lidar.cloud import Cloud, HasPoints, cloud_of
 from odomap.lidar.degeneracy import judge
-from odomap.lidar.ndt import distributions
+from odomap.lidar.methods import Method, RegistrationConfig, align_by, stages_of
 from odomap.lidar.target import FEWEST, Sampled, Target, check_enough, sample, suitable_voxel
-from odomap.limits import Count, check_limits
 
-__all__ = ["METHODS", "Method", "Registration", "RegistrationConfig", "register"]
+__all__ = ["Registration", "RegistrationConfig", "register"]
 
 Array = NDArray[np.float64]
 
-Method = Literal["gicp", "plane", "icp", "ndt"]
-METHODS = ("icp", "plane", "gicp", "ndt")
-CELLS = (8.0, 4.0)
-"""Sides of the cells of NDT, in voxels, one after the other."""
-COARSE_POINTS = 500
-"""Least points of the first, sparse look."""
-
-
-@dataclass(frozen=True)
-class RegistrationConfig:
-    """How clouds are laid onto each other."""
-
-    method: Method = "gicp"
-    """What is minimised: gicp, plane, icp, ndt."""
-    voxel: float | None = None
-    """Side of the voxels both are down-sampled to, metres; 0: not at all; None: what suits the
-    target, a twentieth of its mean distance from its middle."""
-    max_distance: float | None = None
-    """Farthest that a pair may be apart, metres; twice that at first and half of it in the end.
-    None: four voxels."""
-    loss: Loss = field(default_factory=Loss)
-    """Robust loss of a pair, in standard deviations that its median tells; quadratic: none."""
-    iterations: Count = 60
-    """Most steps with all points."""
-    tolerance: float | None = None
-    """Root mean square motion of the points below which it is over, metres; None: voxel / 1000."""
-    neighbours: Count = 10
-    """Points that tell a normal where voxels do not."""
-    threads: Count = 1
-    """How many share the points. The result does not depend on it."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
-        if self.method not in METHODS:
-            hint = nearest_name(self.method, METHODS)
-            raise ConfigError(
-                f"method: '{self.method}' is unknown{hint}; known are {', '.join(METHODS)}"
-            )
-        for name, least in (("voxel", 0.0), ("max_distance", None), ("tolerance", 0.0)):
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if not (np.isfinite(value) and (value > 0.0 if least is None else value >= least)):
-                raise ConfigError(f"{name}: is {value}, give metres above 0")
+RIVAL = 0.97
+"""Share of the most inliers at which another motion is as good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +92,7 @@ def register(
     target: ArrayLike | Cloud | HasPoints | Target,
     method: Method | None = None,
     *,
-    initial: ArrayLike | SE3 | SE2 | None = None,
+    initial: ArrayLike | SE3 | SE2 | Literal["global"] | None = None,
     max_distance: float | None = None,
     voxel: float | None = None,
     loss: Loss | str | None = None,
@@ -152,7 +106,8 @@ def register(
             what `sample` made of it before.
         target: as the source; or a `Target` made of it before.
         method: "gicp", "plane", "icp" or "ndt"; default that of the config.
-        initial: first guess of T_target_source, (4, 4), or (3, 3) in the plane; default identity.
+        initial: first guess of T_target_source, (4, 4), or (3, 3) in the plane; or "global", which
+            needs none; default identity.
         max_distance: overrides that of the config, as do voxel, loss and threads.
         voxel: side of voxels, metres.
         loss: robust loss, or its name.
@@ -172,17 +127,41 @@ def register(
     """
     config = _settings(config, method, max_distance, voxel, loss, threads)
     sampled, target = _prepared(source, target, config)
+    stages = stages_of(config, target, len(sampled))
+    if isinstance(initial, str):
+        if initial != "global":
+            raise InputError(f"initial: '{initial}' is unknown: give 'global', or a motion")
+        return _best_of_all(sampled, target, config, stages)
     R, t = _centred(_first_guess(initial, target.is_planar), sampled.origin, target.origin)
-    stages = _stages(config, target, len(sampled))
-    if config.method == "ndt":
-        aligned = _align_cells(config, sampled, target, stages, R, t)
-    else:
-        code = {"icp": ICP, "plane": PLANE, "gicp": GICP}[config.method]
-        pieces = sampled.points, sampled.discs() if code == GICP else sampled.normals
-        surface = target.grid, target.discs if code == GICP else target.normals
-        rest = R, t, config.loss, config.threads
-        aligned = align(code, target.is_planar, stages, pieces, surface, *rest)
-    return _concluded(sampled, target, aligned)
+    return _concluded(sampled, target, align_by(sampled, target, config, stages, R, t))
+
+
+def _best_of_all(
+    source: Sampled, target: Target, config: RegistrationConfig, stages: list[Stage]
+) -> Registration:
+    """Align from all candidates that need no guess; the one after which most points meet is it."""
+    from odomap.lidar.globalalign import candidates
+
+    pieces, surface = (source.points, source.normals), (target.grid.points, target.normals)
+    motions = candidates(pieces, surface, target.spacing, target.is_planar, config.seed)
+    motions = motions or [(np.eye(3), source.origin - target.origin)]
+    ended = [
+        _concluded(source, target, align_by(source, target, config, stages, R, t))
+        for R, t in motions
+    ]
+    ended.sort(key=lambda found: (-found.num_inliers, found.error))
+    best = ended[0]
+    rivals = [r for r in ended[1:] if r.num_inliers >= RIVAL * best.num_inliers]
+    middle = source.origin
+    for rival in rivals:
+        off = np.linalg.inv(best.T_target_source) @ rival.T_target_source
+        apart = float(np.linalg.norm(off[:3, :3] @ middle + off[:3, 3] - middle))
+        turned = float(np.linalg.norm(so3_log(off[:3, :3])))
+        if apart > 4.0 * target.spacing or turned > 0.1:
+            also = f"; {best.reason}" if best.reason else ""
+            ambiguous = f"ambiguous: {apart:.2g} m and {np.degrees(turned):.0f}° away as many meet"
+            return replace(best, reason=ambiguous + also)
+    return best
 
 
 def _settings(
@@ -262,44 +241,6 @@ def _centred(T: Array, source: Array, target: Array) -> tuple[Array, Array]:
     """Return R, t between clouds about their means: t' = R c_s + t - c_t."""
     R = T[:3, :3]
     return np.ascontiguousarray(R), R @ source + T[:3, 3] - target
-
-
-def _stages(config: RegistrationConfig, target: Target, count: int) -> list[Stage]:
-    """Return looks at ever more points with ever less reach.
-
-    The whole of them are paired within half the reach alone: pairs farther apart by then have no
-    counterpart, and would turn the cloud by what the other one does not see.
-    """
-    reach = target.reach if config.max_distance is None else config.max_distance
-    tolerance = target.spacing / 1000.0 if config.tolerance is None else config.tolerance
-    stages = [Stage(1, 0.5 * reach, config.iterations, tolerance)]
-    for stride, share in ((2, 1.0), (8, 2.0)):
-        if count < stride * COARSE_POINTS:
-            stride = 1
-        coarse = max(tolerance, 0.01 * share * target.spacing)
-        stages.insert(0, Stage(stride, share * reach, config.iterations, coarse))
-    return stages
-
-
-def _align_cells(
-    config: RegistrationConfig,
-    source: Sampled,
-    target: Target,
-    stages: list[Stage],
-    R: Array,
-    t: Array,
-) -> Aligned:
-    """Align by NDT in ever smaller cells; then pair points, for what is said about the result."""
-    pieces, planar = (source.points, source.normals), target.is_planar
-    iterations, converged = 0, True
-    for side, stage in zip(CELLS, stages[-2:], strict=True):
-        cells = distributions(target.grid.points, side * target.spacing, planar)
-        found = align(NDT, planar, [stage], pieces, cells, R, t, Loss(), config.threads)
-        R, t, converged = found.R, found.t, found.converged
-        iterations += found.iterations
-    once = [replace(stages[-1], iterations=1)]
-    paired = align(PLANE, planar, once, pieces, (target.grid, target.normals), R, t, Loss())
-    return Aligned(R, t, paired.rows, iterations, converged)
 
 
 def _concluded(source: Sampled, target: Target, aligned: Aligned) -> Registration:
