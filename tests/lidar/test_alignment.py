@@ -8,7 +8,7 @@ from odomap.geometry.lie import so3_exp
 from odomap.geometry.robust import Loss
 from odomap.lidar import alignment
 from odomap.lidar.alignment import GICP, ICP, PLANE, Stage, align, sum_pairs
-from odomap.lidar.gicp import EPSILON, disc_metric_into, discs
+from odomap.lidar.gicp import EPSILON, disc_metric_into, discs, sure_normals
 from odomap.lidar.icp import SLOTS, newton_step, pair_step
 from odomap.lidar.neighbours import Grid
 
@@ -98,6 +98,12 @@ def test_discs_are_thick_where_points_are_scattered_or_few():
     few = np.array([[5, 0.0, 1.0, 1.0], [500, 0.008, 1.0, 1.0]])  # flat by chance
     lengths = np.linalg.norm(discs(np.tile([0.0, 0, 1], (2, 1)), few, 0.4), axis=1)
     np.testing.assert_allclose(lengths**2, [1 - 0.05, 1 - 0.0505], atol=1e-9)
+
+
+def test_normals_count_for_planes_as_their_discs_do():
+    n = np.tile([0.0, 0.0, 1.0], (3, 1))
+    lengths = np.linalg.norm(sure_normals(n, n * np.sqrt([[1 - EPSILON], [0.9], [0.0]])), axis=1)
+    np.testing.assert_allclose(lengths**2, [1.0, EPSILON / 0.1, EPSILON])
 
 
 def test_the_median_that_scales_a_loss():

@@ -24,9 +24,10 @@ def squared_errors(world, seeds, **settings):
     return np.array(found)
 
 
+@pytest.mark.parametrize("method", ["plane", "gicp"])
 @pytest.mark.parametrize(("world", "voxel"), [(ROOM, 0.25), (ROOM_2D, 0.1)])
-def test_errors_scatter_as_the_information_says(world, voxel):
-    mean = squared_errors(world, 20, voxel=voxel).mean()
+def test_errors_scatter_as_the_information_says(world, voxel, method):
+    mean = squared_errors(world, 20, voxel=voxel, method=method).mean()
     assert 0.4 < mean < 2.0
 
 

@@ -1,5 +1,7 @@
 """A real pair of clouds with a known motion: error, and from how far off it is found."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,8 @@ def off(found, truth):
 
 
 @pytest.mark.parametrize(
-    ("method", "metres", "degrees"), [("gicp", 0.02, 0.2), ("plane", 0.02, 0.4), ("icp", 0.04, 0.5)]
+    ("method", "metres", "degrees"),
+    [("gicp", 0.02, 0.2), ("plane", 0.02, 0.2), ("ndt", 0.02, 0.4), ("icp", 0.04, 0.5)],
 )
 def test_the_motion_is_found_without_settings(pair, method, metres, degrees):
     source, target, truth = pair
@@ -53,6 +56,17 @@ def test_it_is_found_from_a_metre_and_twenty_degrees(pair):
         metres, degrees = off(odomap.register(source, ready, initial=start), truth)
         assert metres < 0.05
         assert degrees < 0.5
+
+
+def test_it_is_found_without_a_first_guess(pair):
+    source, target, truth = pair
+    T = se3_exp(np.array([30.0, -20.0, 5.0, 1.0, -2.0, 1.5]))
+    points = source.points @ T[:3, :3].T + T[:3, 3]
+    found = odomap.register(points, target, initial="global")
+    found = dataclasses.replace(found, T_target_source=found.T_target_source @ T)
+    metres, degrees = off(found, truth)
+    assert metres < 0.03
+    assert degrees < 0.3
 
 
 def test_both_ways_agree(pair):

@@ -209,8 +209,9 @@ def _step(
     gain = 0.0
     for c in range(6):
         gain += xi[c] * total[21 + c]
-    across = 2.0 * EPSILON if method == GICP else 1.0
-    return float(np.sqrt(max(across * gain, 0.0) / total[COUNT]))
+    if method == GICP:
+        return float(np.sqrt(max(2.0 * EPSILON * gain, 0.0) / total[COUNT]))
+    return float(np.sqrt(max(gain, 0.0) / (total[0] + total[6] + total[11])))  # Σ w |n|²
 
 
 @kernel

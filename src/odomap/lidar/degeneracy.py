@@ -15,7 +15,7 @@ less than may be chance, three times the share of the noise.
 
 Errors are taken for independent; where pairs share what the model does not say (edges, curvature,
 motion within a sweep) a motion is less sure than I says. Simulated rooms: the square of the error
-in units of I is 0.7 to 1.6 of what it should be for gicp, up to 5 for planes.
+in units of I is 0.7 to 2.1 of what it should be.
 
 Reference: J. Zhang, M. Kaess, S. Singh, "On degeneracy of optimization-based state estimation
 problems", ICRA 2016.

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 
-__all__ = ["EPSILON", "disc_metric_into", "discs", "warm_up"]
+__all__ = ["EPSILON", "disc_metric_into", "discs", "sure_normals", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -53,6 +53,12 @@ def discs(normals: Array, spreads: Array, size: float) -> Array:
     mean = float(thickness[known].mean()) if known.any() else 0.0
     epsilon = np.clip((thickness + PRIOR * mean / count) / (size * size), EPSILON, 1.0)
     return np.asarray(normals * np.sqrt(1.0 - epsilon)[:, None])
+
+
+def sure_normals(normals: Array, scaled: Array) -> Array:
+    """Return normals (N, 3) scaled to count as their discs do: by √(10⁻³ / ε) of `discs`' ε."""
+    epsilon = np.maximum(1.0 - np.sum(scaled * scaled, axis=1), EPSILON)
+    return np.asarray(normals * np.sqrt(EPSILON / epsilon)[:, None])
 
 
 @kernel

@@ -7,6 +7,7 @@ other held, until nothing moves. What "together" means makes the method, with e 
     point to point    Σ w |e|²         closed form: R from Σ w (p - p̄)(q - q̄)ᵀ, t = q̄ - R p̄
     point to plane    Σ w (nᵀ e)²      Gauss-Newton: points may slide along the target's surface
 
+Normals of any length weigh what they stand for: n is the shorter the less it is sure (`gicp`).
 A step turns about the target's axes, T ← (Exp φ R, t + ρ) to first order e ← e - ρ - φ × x with
 x = R p, so that with J = [I  -x^] and any metric M
 

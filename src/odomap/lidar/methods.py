@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from odomap.errors import ConfigError, nearest_name
 from odomap.geometry.robust import Loss
 from odomap.lidar.alignment import GICP, ICP, NDT, PLANE, Aligned, Stage, align
+from odomap.lidar.gicp import sure_normals
 from odomap.lidar.ndt import distributions
 from odomap.lidar.target import Sampled, Target
 from odomap.limits import Count, check_limits
@@ -91,9 +92,9 @@ def align_by(
         return _align_cells(config, source, target, stages, R, t)
     code = {"icp": ICP, "plane": PLANE, "gicp": GICP}[config.method]
     pieces = source.points, source.discs() if code == GICP else source.normals
-    surface = target.grid, target.discs if code == GICP else target.normals
+    normals = sure_normals(target.normals, target.discs) if code == PLANE else target.discs
     rest = R, t, config.loss, config.threads
-    return align(code, target.is_planar, stages, pieces, surface, *rest)
+    return align(code, target.is_planar, stages, pieces, (target.grid, normals), *rest)
 
 
 def stages_of(config: RegistrationConfig, target: Target, count: int) -> list[Stage]:

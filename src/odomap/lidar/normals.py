@@ -44,6 +44,8 @@ FEWEST_CELLS = 5
 """And how many of them must be occupied: a plane fills nine."""
 FEWEST_CELLS_IN_PLANE = 2
 """A wall seen in the plane fills three, two at its end."""
+FAR = 10.0
+"""Cells in the side of those in which the nearest of lonely points are searched."""
 LINE = 0.03
 """Of λ₂: what λ₁ must exceed λ₀ by, else points lie on a line, about which any normal may turn."""
 
@@ -185,7 +187,7 @@ def cell_covariances(cells: Cells, means: Array, k: int, planar: bool = False) -
     for reach in (1, 2):
         _around_kernel(few, reach, cells.keys, cells.sums, cells.table, cells.size, spread)
         few = few[(spread[few, 0] < FEWEST) | (spread[few, 7] < fewest)]
-    _from_nearest(means, few, k, spread)
+    _from_nearest(means, few, k, spread, FAR * cells.size)
     return spread
 
 
@@ -196,9 +198,9 @@ def nearest_covariances(points: Array, k: int) -> Array:
     return spread
 
 
-def _from_nearest(points: Array, which: Index, k: int, spread: Array) -> None:
+def _from_nearest(points: Array, which: Index, k: int, spread: Array, size: float = 0.0) -> None:
     if len(which):
-        rows, _ = k_nearest(points[which], points, k)
+        rows, _ = k_nearest(points[which], points, k, size=size)
         _nearest_kernel(points, which, rows, spread)
 
 

@@ -118,22 +118,24 @@ def sum_cells(
 
     Returns where it stopped, for want of room if before the end, and how many cells there are.
     """
-    inverse = 1.0 / size
+    inverse, last, cell = 1.0 / size, -1, -1
     for n in range(first, points.shape[0]):
         i = int(np.floor(points[n, 0] * inverse))
         j = int(np.floor(points[n, 1] * inverse))
         k = int(np.floor(points[n, 2] * inverse))
         key = key_of(i, j, k)
-        slot = slot_of(key, table)
-        cell = table[slot, 1]
-        if cell < 0:
-            if count == keys.shape[0]:
-                return n, count
-            cell = count
-            table[slot, 0], table[slot, 1], keys[cell] = key, cell, key
-            for c in range(10):
-                sums[cell, c] = 0.0
-            count += 1
+        if key != last:  # points that follow one another often share a cell
+            slot = slot_of(key, table)
+            cell = int(table[slot, 1])
+            last = key
+            if cell < 0:
+                if count == keys.shape[0]:
+                    return n, count
+                cell = count
+                table[slot, 0], table[slot, 1], keys[cell] = key, cell, key
+                for c in range(10):
+                    sums[cell, c] = 0.0
+                count += 1
         cell_of[n] = cell
         x = points[n, 0] - (i + 0.5) * size
         y = points[n, 1] - (j + 0.5) * size
