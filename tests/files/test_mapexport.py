@@ -107,7 +107,7 @@ def test_what_is_wrong_with_the_words(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken.odomap").write_bytes(file.read_bytes()[:-40])
     for words, message in (
-        ([str(file)], "say what of the map: --points, --trajectory or --graph FILE"),
+        ([str(file)], "say what of the map: --points, --trajectory, --graph or --grid FILE"),
         ([str(file), "--points", "p.obj"], "--points p.obj: give a name that ends in .ply"),
         ([str(file), "--graph", "p.tum"], "--graph p.tum: give a name that ends in .g2o"),
         ([str(file), "--trajectory", "a.gz", "--graph", "a.gz"], "give names of their own"),
