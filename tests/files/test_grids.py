@@ -217,6 +217,10 @@ def test_a_turned_grid_is_turned_back(tmp_path, turn):
         ({"image": "../none.pgm"}, "No such file"),
         ({"image": "/dev/zero"}, "no file that could hold a picture"),
         ({"image": "."}, "no file that could hold a picture"),
+        ({"image": "a\0b"}, "null byte"),
+        ({"resolution": 10**400}, "finite"),
+        ({"origin": [10**400, 0, 0]}, "finite"),
+        ({"negate": [0]}, "must be 0 or 1"),
         ({"image": "a.yaml"}, "neither PGM"),
     ],
 )
@@ -226,7 +230,7 @@ def test_fields_that_cannot_be_are_one_clear_line(tmp_path, fields, said):
     file.write_text(yaml.safe_dump(content))
     with pytest.raises(InputError, match=said) as error:
         load_grid(file)
-    assert str(error.value).startswith((str(tmp_path), "/dev/zero: "))
+    assert str(error.value).startswith((str(tmp_path), f"'{tmp_path}", "/dev/zero: "))
     assert "\n" not in str(error.value)
 
 

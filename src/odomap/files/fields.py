@@ -183,9 +183,13 @@ class Fields:
                 raise self.error(name, f"must hold numbers, not '{value}'") from None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.error(name, f"must hold numbers, not {_kind(value)}")
-        if not np.isfinite(value):
-            raise self.error(name, f"must hold finite numbers, not {value}")
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            number = float("inf")
+        if not np.isfinite(number):
+            raise self.error(name, f"must hold finite numbers, not {number}")
+        return number
 
     def _se3(self, name: str, matrix: NDArray[np.float64]) -> SE3:
         rotation = matrix[:3, :3]

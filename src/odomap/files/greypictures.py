@@ -71,6 +71,8 @@ def read_grey(path: Path, most_pixels: int) -> GreyPicture:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:  # a name that can be none, as one with a zero in it
+        raise InputError(f"{str(path)!r}: {error}") from error
     if data[:2] in (b"P5", b"P2"):
         return GreyPicture(_pgm(path, data, most_pixels))
     if data.startswith(PNG):
