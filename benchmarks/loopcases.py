@@ -19,7 +19,7 @@ from odomap.sensors.rig import Rig
 from odomap.system.config import Config
 from odomap.system.slam import Slam
 from odomap.system.stages import Loop
-from odomap.system.visual import Result
+from odomap.system.system import Result
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

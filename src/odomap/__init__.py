@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from odomap.system.config import Config, preset
     from odomap.system.odometry import MonocularVO, RgbdVO, StereoVO
     from odomap.system.slam import Slam
-    from odomap.system.visual import Result
+    from odomap.system.system import Result
     from odomap.viewing import View
     from odomap.vision.places import Places
 
@@ -202,7 +202,7 @@ _HOMES = {
     "PoseGraph": "backend.graphs.posegraph",
     "Priors": "backend.graphs.posegraph",
     "Registration": "lidar.registration",
-    "Result": "system.visual",
+    "Result": "system.system",
     "RgbdVO": "system.odometry",
     "Rig": "sensors.rig",
     "SE2": "geometry.pose",

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from odomap.savedmap import SavedMap
     from odomap.sensors.rig import Rig
     from odomap.system.config import Config
-    from odomap.system.visual import VisualSystem
+    from odomap.system.system import System
 
 __all__ = ["SystemChoice"]
 
@@ -80,7 +80,7 @@ class SystemChoice:
             said |= {"map": self.saved.name, "is_mapping": self.is_mapping}
         return said
 
-    def make(self, rig: "Rig", settings: "Config", data: object) -> "VisualSystem":
+    def make(self, rig: "Rig", settings: "Config", data: object) -> "System":
         """Make the system.
 
         Args:

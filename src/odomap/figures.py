@@ -16,7 +16,7 @@ from odomap.maps.estimate import Status
 
 if TYPE_CHECKING:
     from odomap.sources.source import Source
-    from odomap.system.visual import Result
+    from odomap.system.system import Result
 
 __all__ = ["figures"]
 

@@ -27,7 +27,7 @@ from odomap.version import __version__
 if TYPE_CHECKING:
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.visual import Result
+    from odomap.system.system import Result
     from odomap.views.loopview import LoopView
     from odomap.views.record import Report
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from odomap.sensors.rig import Rig
     from odomap.sources.source import Source
     from odomap.system.config import Config
-    from odomap.system.visual import Result, VisualSystem
+    from odomap.system.system import Result, System
     from odomap.system.worker import Worker
     from odomap.viewing import View
 
@@ -253,7 +253,7 @@ def _warm_up(tell: Callable[[Progress], None]) -> float:
 
 def _track(
     source: "Source",
-    system: "VisualSystem",
+    system: "System",
     logbook: Logbook,
     outputs: "Outputs | None",
     max_frames: int | None,

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
 __all__ = ["SavedMap", "map_file", "map_settings", "rig_differences"]
 
-KINDS = {"stereo": "a stereo pair", "rgbd": "a camera with depth", "mono": "one camera"}
+KINDS = {
+    "stereo": "a stereo pair",
+    "rgbd": "a camera with depth",
+    "mono": "one camera",
+    "lidar2d": "a 2D laser",
+}
 """What `tracking.sensors` says, in words."""
 
 FILE = "map.odomap"
@@ -93,27 +98,35 @@ class SavedMap:
         Raises:
             InputError: it holds no places, or was made with other cameras.
         """
-        from odomap.system.recognition import describes_places
-
-        if not self.map.num_landmarks:
-            raise InputError(f"{self.name}: the map has no landmarks: nothing could be localised")
-        if not describes_places(self.map):
-            raise InputError(
-                f"{self.name}: none of its landmarks has a descriptor, so no place in it can be "
-                "recognised: make a map with `odomap run` without --odometry-only"
-            )
         used = config.tracking.sensors
         if self.sensors and self.sensors != used:
             raise InputError(
                 f"{self.name}: was made with {KINDS[self.sensors]}, not with {KINDS[used]}: "
                 f"choose --preset {self.sensors}"
             )
+        self._check_places(used)
         if self.rig is None:
             return
         for difference in rig_differences(self.rig, rig, used):
             raise InputError(
                 f"{self.name}: was made with another rig: {difference}: give a recording of the "
                 "same cameras, or their calibration with --rig"
+            )
+
+    def _check_places(self, sensors: str) -> None:
+        """Make sure that something could be recognised in the map."""
+        from odomap.system.recognition import describes_places
+
+        if sensors == "lidar2d":
+            if not any(self.map.keyframe(k).scan is not None for k in self.map.keyframe_ids):
+                raise InputError(f"{self.name}: the map has no scans: nothing could be localised")
+            return
+        if not self.map.num_landmarks:
+            raise InputError(f"{self.name}: the map has no landmarks: nothing could be localised")
+        if not describes_places(self.map):
+            raise InputError(
+                f"{self.name}: none of its landmarks has a descriptor, so no place in it can be "
+                "recognised: make a map with `odomap run` without --odometry-only"
             )
 
     def notes(self, config: "Config") -> list[str]:
@@ -168,6 +181,9 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
         here: the rig of a recording.
         sensors: stereo, rgbd or mono.
     """
+    if sensors == "lidar2d":
+        yield from _lasers(there, here)
+        return
     if sensors == "rgbd" and here.depth is None:
         yield "a depth image there, none here"
     theirs, ours = _used(there, sensors), _used(here, sensors)
@@ -210,3 +226,19 @@ def _text(value: Any) -> str:
     if isinstance(value, str | int):
         return str(value)
     return str(np.array(value).round(6).tolist()) if np.ndim(value) else f"{value:.9g}"
+
+
+def _lasers(there: Rig, here: Rig) -> Iterator[str]:
+    """Yield in what the 2D lasers differ whose scans are kept: scans are numbers, one per beam."""
+    theirs, ours = (
+        next((mount for mount in rig.lidars if mount.angles[2]), None) for rig in (there, here)
+    )
+    if theirs is None or ours is None:
+        yield "a 2D laser there, none here" if ours is None else "no 2D laser there, one here"
+    elif theirs.angles != ours.angles:
+        words = [
+            f"{m.angles[2]} beams from {np.degrees(m.angles[0]):.1f}° to "
+            f"{np.degrees(m.angles[1]):.1f}°"
+            for m in (theirs, ours)
+        ]
+        yield f"{words[0]} there, {words[1]} here"

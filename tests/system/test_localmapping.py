@@ -19,7 +19,8 @@ from odomap.system.background import ThreadConfig
 from odomap.system.config import Config, preset
 from odomap.system.depthbias import DepthBias
 from odomap.system.localmapping import KEPT, LocalMapper
-from odomap.system.slam import Slam, _sections
+from odomap.system.slam import Slam
+from odomap.system.visualslam import _sections
 from system.conftest import Recording
 from windowworlds import CAMERA, row, with_duplicates, with_features, world
 

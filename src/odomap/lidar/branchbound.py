@@ -1,9 +1,10 @@
 """Searching a grid for a scan: the best of all poses in a window, by branch and bound.
 
-A pose is as good as its points lie on what is occupied, s(x) = Σ_i m(T_x p_i). All headings that
-differ by a cell at the farthest point, and all shifts by whole cells, are candidates: some hundred
-thousand. Shifts are taken together, 2^h by 2^h of them, and bounded by what the best cell near each
-point could give,
+A pose is as good as its points lie on walls, s(x) = Σ_i m(T_x p_i), where m is 1 in cells that are
+rather occupied than free, one half beside them, for poses are tried in steps of a cell, and 0
+elsewhere. All headings that differ by a cell at the farthest point, and all shifts by whole cells,
+are candidates: some hundred thousand. Shifts are taken together, 2^h by 2^h of them, and bounded by
+what the best cell near each point could give,
 
     m_h(c) = max_{0 ≤ a, b < 2^h} m(c + (a, b)),     s(x) ≤ Σ_i m_h(T_x p_i),
 
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.grid import OccupancyGrid
+from odomap.lidar.grid import OccupancyGrid, beside, is_wall
 
 __all__ = ["Found", "GridPyramid"]
 
@@ -31,8 +32,8 @@ Levels = NDArray[np.uint8]
 Index = NDArray[np.int64]
 Columns = NDArray[np.int32]
 
-FULL = 255
-"""m = 1, as it is kept."""
+FULL, HALF = np.uint8(255), np.uint8(128)
+"""m = 1 and 1/2, as they are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +63,9 @@ class GridPyramid:
         self._origin = part.origin - room * grid.resolution
         height, width = part.log_odds.shape
         self._levels: Levels = np.zeros((levels + 1, height + room, width + room), np.uint8)
-        share = np.clip(part.log_odds / grid.evidence.limit, 0.0, 1.0)
-        self._levels[0, room:, room:] = np.round(FULL * share)
+        self._levels[0, room:, room:] = np.maximum(
+            FULL * is_wall(part), HALF * beside(is_wall(part))
+        )
         for h in range(levels):
             widen(self._levels[h], 1 << h, self._levels[h + 1])
 
@@ -97,13 +99,14 @@ class GridPyramid:
         )
         cells = int(np.ceil(reach / self.resolution))
         best = np.zeros(3, np.int64)
-        bound = int(least * FULL * len(points_body))
+        full = int(FULL) * len(points_body)
+        bound = int(least * full)
         total = search_kernel(self._levels, columns, rows, cells, bound, best)
         if total <= bound:
             return None
         shift = self.resolution * best[1:]
         found = np.array([x_middle[0] + shift[0], x_middle[1] + shift[1], headings[best[0]]])
-        return Found(found, total / (FULL * len(points_body)))
+        return Found(found, total / full)
 
 
 @kernel

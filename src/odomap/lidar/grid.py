@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from odomap.kernels import kernel
 from odomap.limits import Positive, check_limits
 
-__all__ = ["Evidence", "OccupancyGrid"]
+__all__ = ["Evidence", "OccupancyGrid", "beside", "is_wall"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.float32]
@@ -60,11 +60,15 @@ class OccupancyGrid:
     Args:
         resolution: size of a cell, metres.
         evidence: what a beam says.
+        keeps_hits: whether it is kept where in their cells points of surfaces lie, so that scans
+            can be matched to a fraction of a cell.
 
     Attributes:
         resolution: size of a cell, metres.
         origin: (2,) the corner of cell (0, 0) with the smallest x and y, metres.
         log_odds: (H, W) float32, row by row along y; 0 where nothing is known.
+        hits: (H, W, 3) float32, of the points of surfaces in a cell the sums of x and y within it,
+            in cells, and their number; None where that is not kept.
 
     Example:
         >>> grid = OccupancyGrid(0.1)
@@ -73,12 +77,18 @@ class OccupancyGrid:
         [0.71, 0.43, 0.5]
     """
 
-    def __init__(self, resolution: float = 0.05, evidence: Evidence | None = None) -> None:
+    def __init__(
+        self,
+        resolution: float = 0.05,
+        evidence: Evidence | None = None,
+        keeps_hits: bool = False,
+    ) -> None:
         if not (np.isfinite(resolution) and resolution > 0.0):
             raise ValueError(f"a cell of {resolution} m: its size must be positive")
         self.resolution, self.evidence = resolution, Evidence() if evidence is None else evidence
         self.origin = np.zeros(2)
         self.log_odds: Cells = np.zeros((0, 0), np.float32)
+        self.hits: Cells | None = np.zeros((0, 0, 3), np.float32) if keeps_hits else None
         self._marks: Marks = np.zeros((0, 0), np.int32)
         self._count = 0
 
@@ -143,6 +153,8 @@ class OccupancyGrid:
         occupied = len(hits) + len(between)
         parts = self.log_odds, self._marks, self._count
         hit_cells(*parts, ends[:occupied], evidence.hit, evidence.limit)
+        if self.hits is not None:
+            sum_hits(self.hits, ends[:occupied])
         rays = np.concatenate([ends[: len(hits)], ends[occupied:]])
         pass_cells(*parts, starts, rays, evidence.miss, evidence.limit)
 
@@ -155,6 +167,17 @@ class OccupancyGrid:
         x, y = cells[is_in].T
         found[is_in] = 1.0 / (1.0 + np.exp(-self.log_odds[y, x].astype(np.float64)))
         return found
+
+    def share_in_free(self, points: Array) -> float:
+        """Return the share of points (N, 2) that lie in the open: a cell off any wall at least."""
+        x, y = np.floor((points - self.origin) / self.resolution).astype(np.int64).T
+        height, width = self.log_odds.shape
+        is_in = (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
+        x, y = x[is_in], y[is_in]
+        steps = np.arange(-1, 2)
+        around = self.log_odds[y[:, None, None] + steps[:, None], x[:, None, None] + steps]
+        in_free = (self.log_odds[y, x] < 0.0) & (around.max(axis=(1, 2), initial=-1.0) <= 0.0)
+        return float(in_free.sum()) / max(len(points), 1)
 
     def centres(self, cells: NDArray[np.int64]) -> Array:
         """Return the middles (N, 2), metres, of (N, 2) cells, row and column."""
@@ -188,13 +211,31 @@ class OccupancyGrid:
             raise ValueError(f"a grid of {size[0]} x {size[1]} cells: a scan is far from others")
         self.log_odds = _moved(self.log_odds, before, size)
         self._marks = _moved(self._marks, before, size)
+        if self.hits is not None:
+            self.hits = _moved(self.hits, before, size)
         self.origin = self.origin - self.resolution * before
+
+
+def is_wall(grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Return (H, W) cells that are rather occupied than free."""
+    return np.asarray(grid.log_odds > 0.0)
+
+
+def beside(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (H, W) which cells are marked (H, W), or touch one that is."""
+    near = cells.copy()
+    near[1:] |= cells[:-1]
+    near[:-1] |= cells[1:]
+    wide = near.copy()
+    wide[:, 1:] |= near[:, :-1]
+    wide[:, :-1] |= near[:, 1:]
+    return wide
 
 
 def _moved(cells: NDArray[C], before: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[C]:
     """Return cells with room around them."""
-    larger = np.zeros((size[1], size[0]), cells.dtype)
-    height, width = cells.shape
+    larger = np.zeros((size[1], size[0], *cells.shape[2:]), cells.dtype)
+    height, width = cells.shape[:2]
     if cells.size:
         larger[before[1] : before[1] + height, before[0] : before[0] + width] = cells
     return larger
@@ -212,6 +253,16 @@ def find_box(points: Array, box: Array) -> bool:
             box[0, k] = min(box[0, k], points[i, k])
             box[1, k] = max(box[1, k], points[i, k])
     return True
+
+
+@kernel
+def sum_hits(hits: Cells, ends: Array) -> None:
+    """Σ (x, y, 1) of points in their cells."""
+    for i in range(len(ends)):
+        x, y = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
+        hits[y, x, 0] += ends[i, 0] - x
+        hits[y, x, 1] += ends[i, 1] - y
+        hits[y, x, 2] += 1.0
 
 
 @kernel
@@ -270,5 +321,5 @@ def pass_cells(
 
 def warm_up() -> None:
     """Compile the kernels of this module."""
-    grid = OccupancyGrid(0.1)
+    grid = OccupancyGrid(0.1, keeps_hits=True)
     grid.insert(np.zeros(2), np.array([[0.35, 0.1]]))

@@ -10,7 +10,8 @@ where walls do not say enough, as along a corridor. That cells of one wall diffe
 the way along it: of the slope at a point only what is across its surface counts, ∇m ← n nᵀ ∇m. So
 the Hessian H, what the scan says, is small in that direction. And a wall is known by its cells, and
 may be anywhere in them, the same for all points on it: with D of a quarter of a cell, the
-information is (H⁻¹ + D)⁻¹.
+information is (H⁻¹ + D)⁻¹. Where a grid keeps the means μ of points in its cells, the last steps
+are from points to lines, min Σ ρ(nᵀ(T_x p_i - μ) / σ) + ..., and D is a part of that.
 
 Cost: 16 cells for each point and step.
 
@@ -32,10 +33,17 @@ Array = NDArray[np.float64]
 
 SIGMA = 0.5
 """Standard deviation of 1 - m where a point lies on a wall."""
-ON_WALL = 0.3
-"""Least m of a point that lies on one."""
+ON_WALL = 0.1
+"""Least m of a point that lies on one: a single hit is enough."""
 IN_COMMON = 0.25, 0.002
 """Standard deviation of what all points of a scan are off by together: in cells, in radians."""
+LINE = 0.02
+"""Standard deviation of a point across the line through the mean of a cell, metres."""
+OFF_LINE = 3.0
+"""How many of these off it counts half: it may be of another surface."""
+IN_COMMON_LINES = 0.04, 0.0005
+"""What all points of a scan are off by together then: in cells, in radians."""
+REFINED = 6
 STEPS = 20
 LONGEST = 2.0, 0.1
 """Most that a step may be: in cells, in radians."""
@@ -67,6 +75,7 @@ def match_to_grid(
     normals_body: Array,
     x_guess: Array,
     information: Array | None = None,
+    x_predicted: Array | None = None,
 ) -> GridMatch:
     """Lay a scan onto a grid.
 
@@ -74,25 +83,32 @@ def match_to_grid(
         grid: what is known.
         points_body: (N, 2), one at least, metres.
         normals_body: (N, 2) of unit length across the surface there; zero where it has none.
-        x_guess: (3,) x, y, heading of the body in the grid: predicted.
-        information: (3, 3) of the prediction, tangent as that of the result; None says nothing.
+        x_guess: (3,) x, y, heading of the body in the grid, to begin with.
+        information: (3, 3) of a prediction, tangent as that of the result; None says nothing.
+        x_predicted: (3,) what is predicted; default the guess.
     """
     x = np.array(x_guess, float)
-    turned = _turn(x[2])
+    expected = np.array(x if x_predicted is None else x_predicted, float)
+    turned = _turn(expected[2])
     prior = np.zeros((3, 3)) if information is None else turned @ information @ turned.T
     H, said = np.zeros((3, 3)), np.zeros(2)
     place = grid.origin, grid.resolution, grid.evidence.limit
     seen = points_body, normals_body
-    match_kernel(grid.log_odds, *place, *seen, np.array(x_guess, float), prior, x, H, said)
+    match_kernel(grid.log_odds, *place, *seen, expected, prior, x, H, said)
+    common = IN_COMMON
+    if grid.hits is not None:
+        cells = grid.log_odds, grid.hits, grid.origin, grid.resolution
+        refine_kernel(*cells, *seen, expected, prior, x, H)
+        common = IN_COMMON_LINES
     turned = _turn(x[2])
-    said_of_body = turned.T @ H @ turned
-    return GridMatch(x, _with_cells(said_of_body, grid.resolution), *(said / len(points_body)))
+    information = _with_cells(turned.T @ H @ turned, grid.resolution, common)
+    return GridMatch(x, information, *(said / len(points_body)))
 
 
-def _with_cells(H: Array, resolution: float) -> Array:
+def _with_cells(H: Array, resolution: float, common: tuple[float, float]) -> Array:
     """(H⁻¹ + D)⁻¹ = H - H (H + D⁻¹)⁻¹ H, which H need not be regular for."""
-    common = np.array([IN_COMMON[0] * resolution, IN_COMMON[0] * resolution, IN_COMMON[1]])
-    return np.asarray(H - H @ np.linalg.solve(H + np.diag(common**-2), H))
+    sigma = np.array([common[0] * resolution, common[0] * resolution, common[1]])
+    return np.asarray(H - H @ np.linalg.solve(H + np.diag(sigma**-2), H))
 
 
 def _turn(angle: float) -> Array:
@@ -216,9 +232,76 @@ def match_kernel(
             x[k] += share * step[k]
 
 
+@kernel
+def nearest_mean(
+    log_odds: Cells, hits: Cells, u: float, v: float, column: int, row: int, mean: Array
+) -> bool:
+    """mean ← that of the occupied cell beside (column, row) that is nearest to (u, v), in cells."""
+    best = 2.0 * 2.0
+    for y in range(max(row - 1, 0), min(row + 2, log_odds.shape[0])):
+        for x in range(max(column - 1, 0), min(column + 2, log_odds.shape[1])):
+            if log_odds[y, x] <= 0.0 or hits[y, x, 2] <= 0.0:
+                continue
+            m_x, m_y = x + hits[y, x, 0] / hits[y, x, 2], y + hits[y, x, 1] / hits[y, x, 2]
+            apart = (m_x - u) ** 2 + (m_y - v) ** 2
+            if apart < best:
+                best, mean[0], mean[1] = apart, m_x, m_y
+    return best < 4.0
+
+
+@kernel
+def refine_kernel(
+    log_odds: Cells,
+    hits: Cells,
+    origin: Array,
+    resolution: float,
+    points: Array,
+    normals: Array,
+    x_predicted: Array,
+    prior: Array,
+    x: Array,
+    H: Array,
+) -> None:
+    """x ← argmin Σ ρ(nᵀ(T_x p - μ)/σ) + |x - x̂|²_Λ, where p has a normal; H of the sum."""
+    b, A, step, mean = np.empty(3), np.empty((3, 3)), np.zeros(3), np.zeros(2)
+    J = np.empty(3)
+    for _ in range(REFINED):
+        c, s = np.cos(x[2]), np.sin(x[2])
+        H[:], b[:] = 0.0, 0.0
+        for i in range(len(points)):
+            n_x, n_y = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
+            if n_x == 0.0 and n_y == 0.0:
+                continue
+            p_x, p_y = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
+            u, v = (x[0] + p_x - origin[0]) / resolution, (x[1] + p_y - origin[1]) / resolution
+            if not nearest_mean(log_odds, hits, u, v, int(np.floor(u)), int(np.floor(v)), mean):
+                continue
+            off = (n_x * (u - mean[0]) + n_y * (v - mean[1])) * resolution
+            w = 1.0 / (1.0 + (off / (OFF_LINE * LINE)) ** 2) / LINE**2
+            J[0], J[1], J[2] = n_x, n_y, n_y * p_x - n_x * p_y
+            for k in range(3):
+                b[k] += w * J[k] * off
+                for j in range(3):
+                    H[k, j] += w * J[k] * J[j]
+        for k in range(3):
+            for j in range(3):
+                A[k, j] = H[k, j] + prior[k, j]
+                apart = x[j] - x_predicted[j]
+                if j == 2:
+                    apart -= 2.0 * np.pi * np.round(apart / (2.0 * np.pi))
+                b[k] += prior[k, j] * apart
+            A[k, k] += 1e-6
+        if not solve_step(A, b, step):
+            return
+        for k in range(3):
+            x[k] += step[k]
+        if np.hypot(step[0], step[1]) < ENOUGH[0] * resolution and abs(step[2]) < ENOUGH[1]:
+            return
+
+
 def warm_up() -> None:
     """Compile the kernels of this module."""
-    grid = OccupancyGrid(0.1)
+    grid = OccupancyGrid(0.1, keeps_hits=True)
     points = np.array([[0.3, 0.1], [0.3, -0.1]])
     grid.insert(np.zeros(2), points)
-    match_to_grid(grid, points, np.zeros((2, 2)), np.zeros(3), np.eye(3))
+    match_to_grid(grid, points, np.array([[1.0, 0.0], [0.0, 0.0]]), np.zeros(3), np.eye(3))

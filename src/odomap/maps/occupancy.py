@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from odomap.errors import ConfigError, InputError
 from odomap.lidar.grid import Evidence, OccupancyGrid
-from odomap.lidar.scans import Beams, ScanConfig
+from odomap.lidar.scanconfig import ScanConfig
+from odomap.lidar.scans import Beams
 from odomap.lidar.slices import SliceConfig, find_floor, level, slice_sweep
 from odomap.limits import Positive, check_limits
 from odomap.maps.map import Map

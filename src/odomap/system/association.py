@@ -43,8 +43,9 @@ _AS_ONE = np.array([1.0, 1j])
 class TrackingConfig:
     """How frames are placed and when one becomes a keyframe."""
 
-    sensors: Literal["mono", "stereo", "rgbd"] = "stereo"
-    """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image."""
+    sensors: Literal["mono", "stereo", "rgbd", "lidar2d"] = "stereo"
+    """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image;
+    lidar2d: a laser, which no other section of cameras is of use to."""
     association: Literal["features", "flow"] = "features"
     """features: found in every frame and known by their descriptors; SLAM finds them on all levels
     of a pyramid (`orb`), odometry with the detector of `features`. flow: patches followed from the

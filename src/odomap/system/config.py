@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.bundle import BundleConfig
 from odomap.errors import CalibrationError, ConfigError, nearest_name
+from odomap.lidar.scanconfig import ScanConfig
 from odomap.sensors.rig import Rig
 from odomap.system.adjusting import AdjustingConfig
 from odomap.system.association import (
@@ -31,6 +32,7 @@ from odomap.system.localmapping import MappingConfig
 from odomap.system.loopsearch import ClosingConfig
 from odomap.system.mapping import WindowConfig
 from odomap.system.placeindex import PlacesConfig
+from odomap.system.scanconfig import ScanClosingConfig, ScanTrackingConfig, SubmapConfig
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.bootstrap import BootstrapConfig
 from odomap.vision.depth import DepthConfig
@@ -50,6 +52,8 @@ __all__ = [
 ]
 
 
+LASER = "lidar2d"
+"""What `tracking.sensors` says of a 2D laser; sections of cameras are of no use to it then."""
 NO_LOOPS = ClosingConfig(enabled=False)
 """Where landmarks are followed by optical flow: it is for speed, and describes one level only."""
 
@@ -98,6 +102,14 @@ class Config:
     """When loops are looked for, and closed."""
     adjusting: AdjustingConfig = field(default_factory=AdjustingConfig)
     """How the whole map is adjusted after that."""
+    scan: ScanConfig = field(default_factory=ScanConfig)
+    """What of a 2D scan is used."""
+    scan_tracking: ScanTrackingConfig = field(default_factory=ScanTrackingConfig)
+    """How scans are placed and when one becomes a keyframe."""
+    submaps: SubmapConfig = field(default_factory=SubmapConfig)
+    """How large the grids are that scans are laid onto, and of what."""
+    scan_closing: ScanClosingConfig = field(default_factory=ScanClosingConfig)
+    """When scans are searched for in earlier submaps, and the path is corrected."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 
@@ -153,6 +165,10 @@ def _rgbd_flow() -> Config:
     )
 
 
+def _lidar2d() -> Config:
+    return Config(tracking=TrackingConfig(sensors="lidar2d"), closing=NO_LOOPS)
+
+
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
     {
         "stereo": _stereo,
@@ -161,9 +177,10 @@ PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
         "stereo-flow": _stereo_flow,
         "mono-flow": _mono_flow,
         "rgbd-flow": _rgbd_flow,
+        "lidar2d": _lidar2d,
     }
 )
-"""Named configurations: stereo, mono and rgbd, and the same with optical flow, for speed."""
+"""Named configurations: stereo, mono, rgbd, the same with optical flow, for speed, and lidar2d."""
 
 
 def preset(name: str) -> Config:
@@ -184,11 +201,13 @@ def preset(name: str) -> Config:
 
 
 def preset_for(rig: Rig) -> str:
-    """Return the preset for what a rig carries: rgbd, stereo or mono.
+    """Return the preset for what a rig carries: rgbd, stereo or mono, or lidar2d without a camera.
 
     Raises:
-        CalibrationError: it has no camera.
+        CalibrationError: it has neither a camera nor a 2D laser.
     """
+    if not rig.cameras and any(mount.angles[2] for mount in rig.lidars):
+        return LASER
     if not rig.cameras and rig.lidars:
         raise CalibrationError("this rig has a LiDAR and no camera: there is no preset for it yet")
     if not rig.cameras:

@@ -29,7 +29,8 @@ from odomap.system.mapping import WindowMapper
 from odomap.system.path import Path
 from odomap.system.stages import Stages
 from odomap.system.starting import make_start
-from odomap.system.visual import Result, Sight, VisualSystem
+from odomap.system.system import Result
+from odomap.system.visual import Sight, VisualSystem
 
 __all__ = ["MonocularVO", "Odometry", "Result", "RgbdVO", "StereoVO", "make_odometry"]
 

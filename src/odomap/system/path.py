@@ -211,4 +211,6 @@ def _lengths(T_from: Array, T_to: Array) -> Array:
 def _trajectory(rows: list[tuple[int, Array, Array]]) -> Trajectory:
     stamps = np.array([stamp for stamp, _, _ in rows], np.int64)
     Ts = np.array([T for _, T, _ in rows]).reshape(-1, 4, 4)
-    return Trajectory(stamps, Ts, np.array([c for _, _, c in rows]).reshape(-1, 6, 6))
+    covariances = np.array([c for _, _, c in rows]).reshape(-1, 6, 6)
+    order = np.argsort(stamps, kind="stable")  # clocks of old logs jump back
+    return Trajectory(stamps[order], Ts[order], covariances[order])

@@ -1,16 +1,13 @@
 """A visual system: tracker, mapper and map put together for the cameras of a rig.
 
 Odometry and SLAM look through the same eye and measure depth with the same ranger; what differs is
-who tracks and who maps. Here is what they have in common:
-
-    frame → Tracker.track → Estimate → caller;  keyframe → Mapper → map;  finish → Result
+who tracks and who maps. Here is what they have in common.
 
 Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces", ISMAR 2007.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from abc import abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,52 +15,18 @@ from numpy.typing import NDArray
 from odomap.errors import CalibrationError
 from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
-from odomap.geometry.trajectory import Trajectory
-from odomap.maps.estimate import Estimate
 from odomap.maps.map import Map
-from odomap.sensors.frame import Frame
 from odomap.sensors.rig import Rig
 from odomap.system.config import Config
 from odomap.system.depthbias import DepthBias
 from odomap.system.eye import Eye
-from odomap.system.path import Path
 from odomap.system.ranging import DepthRanger, Ranger, StereoRanger
-from odomap.system.rhythms import make_worker
-from odomap.system.stages import Loop, Stages
+from odomap.system.stages import Stages
+from odomap.system.system import System
 from odomap.system.uncertainty import Calibration, NoiseConfig
 from odomap.vision.rectifier import Rectifier
 
-__all__ = ["Result", "Sight", "VisualSystem"]
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a run leaves.
-
-    Attributes:
-        trajectory: T_world_body of all placed frames as known at the end, with covariances.
-        trajectory_live: the frames that could be placed when they came, as they were emitted.
-        keyframes: the keyframes among the frames, as known at the end.
-        map: keyframes and landmarks.
-        is_metric: whether lengths are metres; if not, their unit is the run's own.
-        T_body_tracked: (4, 4) where on the body that is what the poses are of: the identity, or
-            the mount of a single camera, whose path without a scale cannot carry the lever arm.
-        mapping: what local mapping did, counts by name; empty for odometry.
-        loops: places that were taken for ones seen before, accepted or not, in order.
-    """
-
-    trajectory: Trajectory
-    trajectory_live: Trajectory
-    keyframes: Trajectory
-    map: Map
-    is_metric: bool = True
-    T_body_tracked: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    mapping: Mapping[str, int] = field(default_factory=dict)
-    loops: tuple[Loop, ...] = ()
-
-    def truth(self, truth: Trajectory) -> Trajectory:
-        """Return a ground truth of the body as one of what was tracked."""
-        return Trajectory(truth.stamps_ns, truth.Ts_world_body @ self.T_body_tracked)
+__all__ = ["Sight", "VisualSystem"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +88,8 @@ class Sight:
         return Sight(Eye.of_camera(camera), None, mount)
 
 
-class VisualSystem(ABC):
-    """What odometry and SLAM have in common.
+class VisualSystem(System):
+    """What odometry and SLAM with cameras have in common.
 
     Attributes:
         map: keyframes and landmarks.
@@ -134,56 +97,20 @@ class VisualSystem(ABC):
     """
 
     def __init__(self, sight: Sight, config: Config, rhythm: str, map: Map | None = None) -> None:
-        self.map = Map() if map is None else map
-        self._sight = sight
-        stages = self._stages(sight, config)
-        self.worker = make_worker(rhythm, stages, config.threads)
-        self._loops: list[Loop] = []
-        self.worker.on_loop.append(self._loops.append)
+        self._sight, self._config = sight, config
+        super().__init__(config.threads, rhythm, map)
+
+    def _make_stages(self) -> Stages:
+        return self._stages(self._sight, self._config)
 
     @abstractmethod
     def _stages(self, sight: Sight, config: Config) -> Stages:
         """Make the agents that share the map."""
 
     @property
-    @abstractmethod
-    def _path(self) -> Path:
-        """The frames placed so far."""
+    def _is_metric(self) -> bool:
+        return self._sight.ranger is not None
 
-    def track(self, frame: Frame) -> Estimate:
-        """Place one frame.
-
-        Args:
-            frame: the next one in time.
-
-        Returns:
-            Where the body is, how sure that is, and why not if it is lost.
-
-        Raises:
-            CalibrationError: images or depth cannot be what the rig says.
-            KeyboardInterrupt: Ctrl-C was pressed meanwhile; the frame is done all the same.
-        """
-        return self.worker.track(frame)
-
-    def finish(self) -> Result:
-        """Return the path as known at the end; tracking may go on afterwards."""
-        self.worker.finish()
-        self._come_to_rest()
-        return Result(
-            self._path.trajectory(),
-            self._path.trajectory_live(),
-            self._path.keyframes(),
-            self.map,
-            self._sight.ranger is not None,
-            self._sight.T_body_tracked,
-            self._counts(),
-            tuple(self._loops),
-        )
-
-    def _come_to_rest(self) -> None:
-        """Do what is left when nobody changes the map any more."""
-        return
-
-    def _counts(self) -> Mapping[str, int]:
-        """Return what the mapper did, by name."""
-        return {}
+    @property
+    def _T_body_tracked(self) -> NDArray[np.float64]:
+        return self._sight.T_body_tracked

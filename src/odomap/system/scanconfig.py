@@ -1,0 +1,98 @@
+"""Sections of the configuration for a 2D laser, apart from what is compiled."""
+
+from dataclasses import dataclass
+
+from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
+
+__all__ = ["ScanClosingConfig", "ScanTrackingConfig", "SubmapConfig"]
+
+
+@dataclass(frozen=True)
+class SubmapConfig:
+    """How large submaps are, and of what."""
+
+    resolution: Positive = 0.05
+    """Size of a cell, metres."""
+    scans: Count = 60
+    """Keyframes in a submap; the next one begins at half of them."""
+    hit: Positive = 0.9
+    """What a beam says for the cell it came back from, log-odds."""
+    miss: Positive = 0.3
+    """What it says against those on its way, log-odds."""
+    limit: Positive = 4.0
+    """Most that is believed of a cell, log-odds."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
+class ScanTrackingConfig:
+    """How scans are placed and when one becomes a keyframe."""
+
+    use_odometry: bool = True
+    """Whether the wheels' odometry is used, where there is any."""
+    slip: Positive = 0.1
+    """Standard deviation of a motion by odometry, relative to it."""
+    veer: NotNegative = 0.05
+    """The same of the heading per metre, radians."""
+    jitter: Positive = 0.02
+    """Least standard deviation of a motion, metres."""
+    jitter_rad: Positive = 0.01
+    """The same of the heading, radians."""
+    unsteady: Positive = 0.5
+    """Standard deviation of a motion without odometry, relative to one as before."""
+    search: NotNegative = 0.15
+    """How far around it all poses are tried then, metres."""
+    search_rad: NotNegative = 0.12
+    """The same of the heading, radians."""
+    min_hits: Count = 20
+    """Beams that must come back for a scan to say anything."""
+    min_on_walls: Fraction = 0.25
+    """Share of them that must lie on walls of the submap for the scan to fit."""
+    keyframe_m: Positive = 0.2
+    """Way after which a scan becomes a keyframe, metres."""
+    keyframe_rad: Positive = 0.1
+    """Turn after which it does, radians."""
+    lost_reach: Positive = 2.0
+    """How far around the last place a lost body is searched for, metres."""
+    known_score: Fraction = 0.6
+    """Share of the beams that must meet walls for a first scan to be recognised in a map."""
+    known_in_free: Fraction = 0.1
+    """Share of those that may end in the open, relative to those that meet walls or do so."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
+class ScanClosingConfig:
+    """When loops are looked for, and believed."""
+
+    enabled: bool = True
+    """Whether places seen before are searched for."""
+    every: Count = 2
+    """Keyframes after which one is searched for."""
+    most: Count = 2
+    """Submaps that it is searched for in."""
+    apart: Count = 6
+    """Keyframes between two that are tied to the same submap."""
+    least_reach: Positive = 0.5
+    """Half the side of the smallest window, metres."""
+    farthest: Positive = 7.0
+    """Half the side of the largest window, metres."""
+    widest_rad: Positive = 0.5
+    """Half the largest range of headings, radians."""
+    score: Fraction = 0.5
+    """Share of the beams that must meet walls of the submap; those beside one count half."""
+    in_free: Fraction = 0.1
+    """Share of those that may end in the open, relative to those that meet walls or do so."""
+    solve_every: Count = 15
+    """Keyframes after which the path is solved anew if there are new loops; in large maps more."""
+    solve_share: Fraction = 0.02
+    """The same, relative to all keyframes."""
+    doubt: Positive = 3.0
+    """Factor on the standard deviations of loops while it is decided which are true."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
