@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from odomap.maps.occupancy import GridConfig, GridMap
     from odomap.sensors.rig import Rig
 
-__all__ = ["GridExport", "export_grid"]
+__all__ = ["GridExport", "export_grid", "write_grid"]
 
 PIXELS = 20_000
 """Of a depth image at most."""
@@ -113,13 +113,30 @@ def export_grid(
     if not made.grid.is_known.any():
         raise InputError(f"{run}: nothing was seen at these heights and ranges: choose others")
     make_folder(target.parent)
-    written = list(save_grid(target, made.grid))
+    return GridExport(made, write_grid(target, made, picture), (*notes, *made.notes))
+
+
+def write_grid(file: str | Path, made: "GridMap", picture: bool = True) -> tuple[Path, ...]:
+    """Write a grid as YAML and PGM, and as a picture with the path.
+
+    Args:
+        file: ends in `.yaml`.
+        made: the grid.
+        picture: whether to write the PNG.
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputError: one cannot be written.
+    """
+    written = list(save_grid(file, made.grid))
     if picture:
         from odomap.views.gridpicture import grid_png
 
-        written.append(target.with_suffix(".png"))
+        written.append(Path(file).with_suffix(".png"))
         write_bytes(written[-1], grid_png(made.grid, made.path))
-    return GridExport(made, tuple(written), (*notes, *made.notes))
+    return tuple(written)
 
 
 def _warm_up(tell: Progress) -> None:

@@ -56,7 +56,9 @@ REPORTED = (
 )
 """Metrics that the report shows."""
 
-OF_THE_MAP = ("keyframes.tum", "map.odomap")
+GRID_FILE = "grid.yaml"
+"""Name of the grid in the folder of a run; its pictures are beside it."""
+OF_THE_MAP = ("keyframes.tum", "map.odomap", GRID_FILE)
 """What is not written where frames are only placed in a map."""
 
 FLUSH_EVERY = 25
@@ -85,6 +87,7 @@ class Outputs:
         self._config = config_to_yaml(config, {"odomap": __version__} | dict(head))
         self._data = str(head.get("data", ""))
         self._settings, self._map = map_settings(config), str(head.get("map", ""))
+        self._scan, self._picture = config.scan, b""
         self._is_mapping = bool(head.get("is_mapping", True))
         self._part = self.folder / "trajectory_live.tum.part"
         self._live: TextIO | None = None
@@ -131,6 +134,7 @@ class Outputs:
             ),
             ("keyframes.tum", lambda: write_tum(self._at("keyframes.tum"), result.keyframes)),
             ("map.odomap", lambda: self._write_map(source, result, metrics)),
+            *self._grid(source, result),
             *self._loops(source, result, logbook),
             ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
             ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
@@ -174,6 +178,20 @@ class Outputs:
             return []
         loops = loop_log(source, result, logbook)
         return [(LOOPS_FILE, lambda: write_loops(file, loops))]
+
+    def _grid(self, source: "Source", result: "Result") -> list[tuple[str, Callable[[], object]]]:
+        """Return the job of writing a grid, where a laser made the map."""
+        if self._settings["sensors"] != "lidar2d" or not result.map.num_keyframes:
+            return []
+        return [(GRID_FILE, lambda: self._write_grid(source, result))]
+
+    def _write_grid(self, source: "Source", result: "Result") -> None:
+        from odomap.gridmap import write_grid
+        from odomap.maps.occupancy import GridConfig, grid_of_map
+
+        made = grid_of_map(result.map, source.rig, GridConfig(scan=self._scan))
+        *_, picture = write_grid(self._at(GRID_FILE), made)
+        self._picture = picture.read_bytes()
 
     def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
         file = self._at("map.odomap")
@@ -228,6 +246,7 @@ class Outputs:
             mapping=metrics["mapping"] or {},
             beside_ms=metrics.get("beside_ms", {}),
             loops=self._loop_view(source, result, logbook, scale),
+            grid_png=self._picture,
         )
 
     def _loop_view(

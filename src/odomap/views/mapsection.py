@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from odomap.views.page import table, text
+from odomap.views.page import image, table, text
 from odomap.views.record import Growth, Report
 from odomap.views.scene import AXES, scene
 
@@ -15,7 +15,18 @@ __all__ = ["map_section"]
 
 def map_section(report: Report) -> str:
     """Return the section as HTML; empty where a run tells nothing about its map."""
-    return "\n".join(filter(None, [_plan(report), _growth(report), _counts(report.mapping)]))
+    shown = _grid(report.grid_png) if report.grid_png else _plan(report)
+    return "\n".join(filter(None, [shown, _growth(report), _counts(report.mapping)]))
+
+
+def _grid(png: bytes) -> str:
+    """Return a map as a grid: what lasers leave instead of landmarks."""
+    drawn = image(png, "png", "Occupancy grid: walls, free space, what was not seen, and the path")
+    caption = (
+        "Walls are dark, free space is white, grey was never seen; the line is the path. The same "
+        "grid is in grid.yaml and grid.pgm, which map_server loads."
+    )
+    return f"<figure>{drawn}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _plan(report: Report) -> str:
