@@ -4,8 +4,9 @@
 
 PAIR.npz holds source, target, starts (N, 4, 4), voxel and reach. Written: seconds of the whole and
 of the alignment alone, the smallest over the repeats, of each of the peer's methods, and where each
-ended from the identity and from each start. Down-sampling, normals and trees count as the whole;
-reading files does not. Needs numpy and the peer; odomap is not imported.
+ended from the identity and from each start. Seconds are of the processor with one thread.
+Down-sampling, normals and trees count as the whole; reading files does not. Needs numpy and the
+peer; odomap is not imported.
 """
 
 import argparse
@@ -101,18 +102,21 @@ def open3d_methods(pair: Any, threads: int) -> dict[str, tuple[Prepare, Align]]:
     }  # fmt: skip
 
 
-def measure(methods: dict[str, tuple[Prepare, Align]], starts: Array, repeats: int) -> Any:
+def measure(
+    methods: dict[str, tuple[Prepare, Align]], starts: Array, repeats: int, threads: int
+) -> Any:
     """Return seconds of each method, and where it ended: from the identity, then from starts."""
+    clock = time.process_time if threads == 1 else time.perf_counter
     about: dict[str, Any] = {}
     ended: dict[str, Array] = {}
     for name, (prepare, align) in methods.items():
         whole, alone = [], []
         for _ in range(repeats):
-            begin = time.perf_counter()
+            begin = clock()
             prepared = prepare()
-            middle = time.perf_counter()
+            middle = clock()
             first = align(prepared, np.eye(4))
-            end = time.perf_counter()
+            end = clock()
             whole.append(end - begin)
             alone.append(end - middle)
         about[name] = {"whole_s": min(whole), "align_s": min(alone)}
@@ -125,7 +129,7 @@ def main() -> int:
         pair = {name: np.array(arrays[name]) for name in arrays}
     makers = {"small_gicp": small_gicp_methods, "open3d": open3d_methods}
     methods = makers[CHOSEN.peer](pair, CHOSEN.threads)
-    about, ended = measure(methods, pair["starts"], CHOSEN.repeats)
+    about, ended = measure(methods, pair["starts"], CHOSEN.repeats, CHOSEN.threads)
     np.savez(CHOSEN.out, about=json.dumps(about), **ended)
     return 0
 

@@ -44,7 +44,7 @@ FEWEST_CELLS = 5
 """And how many of them must be occupied: a plane fills nine."""
 FEWEST_CELLS_IN_PLANE = 2
 """A wall seen in the plane fills three, two at its end."""
-FAR = 10.0
+FAR = 16.0
 """Cells in the side of those in which the nearest of lonely points are searched."""
 LINE = 0.03
 """Of λ₂: what λ₁ must exceed λ₀ by, else points lie on a line, about which any normal may turn."""
