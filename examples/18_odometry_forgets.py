@@ -23,8 +23,8 @@ def walk(source: odomap.Source) -> list[odomap.Frame]:
 def main() -> dict[str, list[tuple[float, int, int]]]:
     source = odomap.open(f"sim:room?seed=4&frames={FRAMES}&sensors=mono,depth&speed=3")
     frames, results = walk(source), {}
-    for system in (odomap.RgbdVO(source.rig), odomap.Slam(source.rig)):
-        name = type(system).__name__
+    systems = {"RgbdVO": odomap.RgbdVO(source.rig), "Slam": odomap.Slam(source.rig)}
+    for name, system in systems.items():
         results[name] = []
         for i, frame in enumerate(frames):
             T_world_body = system.track(frame).T_world_body

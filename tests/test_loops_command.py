@@ -17,8 +17,8 @@ from odomap.run import Interrupted, run
 from odomap.settings import override
 from odomap.sources.open import open as open_source
 from odomap.system.config import preset
-from odomap.system.slam import Slam
 from odomap.system.stages import Loop, Stages
+from odomap.system.visualslam import VisualSlam
 from odomap.system.worker import InlineWorker
 from stagedoubles import Solved
 
@@ -81,7 +81,7 @@ def cli(capsys):
 
 @pytest.fixture
 def deciding(monkeypatch):
-    monkeypatch.setattr(Slam, "_closer", lambda *_: Deciding())
+    monkeypatch.setattr(VisualSlam, "_closer", lambda *_: Deciding())
 
 
 def book_of(ids, start=0):

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from odomap.errors import InputError
-from odomap.files.atomic import make_folder, write_bytes
-from odomap.files.grids import GRID_SUFFIXES, save_grid
+from odomap.files.atomic import make_folder
+from odomap.files.grids import GRID_SUFFIXES
 from odomap.files.mapfile import MapFile
 from odomap.files.rig import read_rig
 from odomap.geometry.trajectory import Trajectory
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from odomap.maps.occupancy import GridConfig, GridMap
     from odomap.sensors.rig import Rig
 
-__all__ = ["GridExport", "export_grid", "write_grid"]
+__all__ = ["GridExport", "export_grid"]
 
 PIXELS = 20_000
 """Of a depth image at most."""
@@ -112,31 +112,10 @@ def export_grid(
         made, notes = _of_depth(place, data, rig, config, tell)
     if not made.grid.is_known.any():
         raise InputError(f"{run}: nothing was seen at these heights and ranges: choose others")
+    from odomap.views.gridpicture import write_grid
+
     make_folder(target.parent)
     return GridExport(made, write_grid(target, made, picture), (*notes, *made.notes))
-
-
-def write_grid(file: str | Path, made: "GridMap", picture: bool = True) -> tuple[Path, ...]:
-    """Write a grid as YAML and PGM, and as a picture with the path.
-
-    Args:
-        file: ends in `.yaml`.
-        made: the grid.
-        picture: whether to write the PNG.
-
-    Returns:
-        The files.
-
-    Raises:
-        OutputError: one cannot be written.
-    """
-    written = list(save_grid(file, made.grid))
-    if picture:
-        from odomap.views.gridpicture import grid_png
-
-        written.append(Path(file).with_suffix(".png"))
-        write_bytes(written[-1], grid_png(made.grid, made.path))
-    return tuple(written)
 
 
 def _warm_up(tell: Progress) -> None:

@@ -186,8 +186,8 @@ class Outputs:
         return [(GRID_FILE, lambda: self._write_grid(source, result))]
 
     def _write_grid(self, source: "Source", result: "Result") -> None:
-        from odomap.gridmap import write_grid
         from odomap.maps.occupancy import GridConfig, grid_of_map
+        from odomap.views.gridpicture import write_grid
 
         made = grid_of_map(result.map, source.rig, GridConfig(scan=self._scan))
         *_, picture = write_grid(self._at(GRID_FILE), made)

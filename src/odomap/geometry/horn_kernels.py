@@ -127,3 +127,4 @@ def warm_up() -> None:
     """Compile the kernels of this file."""
     p, R, t = np.eye(3), np.empty((3, 3)), np.empty(3)
     horn_into(p, p, np.arange(3), True, R, t, np.empty((4, 4)), np.empty((4, 4)))
+    horn_rotation(np.eye(4), np.empty((4, 4)), 1.0, R)

@@ -16,7 +16,7 @@ J. Amanatides, A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurog
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ __all__ = ["Evidence", "OccupancyGrid", "beside", "is_wall"]
 Array = NDArray[np.float64]
 Cells = NDArray[np.float32]
 Marks = NDArray[np.int32]
+Hits = NDArray[Any]
 C = TypeVar("C", np.float32, np.int32)
 
 MARGIN = 64
@@ -67,8 +68,9 @@ class OccupancyGrid:
         resolution: size of a cell, metres.
         origin: (2,) the corner of cell (0, 0) with the smallest x and y, metres.
         log_odds: (H, W) float32, row by row along y; 0 where nothing is known.
-        hits: (H, W, 3) float32, of the points of surfaces in a cell the sums of x and y within it,
-            in cells, and their number; None where that is not kept.
+        hits: (H, W, 3), of the points of surfaces in a cell the sums of x and y within it, in
+            cells, and their number, float32; of a finished grid numbers of the same ratio, uint8.
+            None where that is not kept.
 
     Example:
         >>> grid = OccupancyGrid(0.1)
@@ -88,7 +90,7 @@ class OccupancyGrid:
         self.resolution, self.evidence = resolution, Evidence() if evidence is None else evidence
         self.origin = np.zeros(2)
         self.log_odds: Cells = np.zeros((0, 0), np.float32)
-        self.hits: Cells | None = np.zeros((0, 0, 3), np.float32) if keeps_hits else None
+        self.hits: Hits | None = np.zeros((0, 0, 3), np.float32) if keeps_hits else None
         self._marks: Marks = np.zeros((0, 0), np.int32)
         self._count = 0
 
@@ -191,7 +193,18 @@ class OccupancyGrid:
         y, x = rows[0], columns[0]
         part = self.log_odds[y : rows[-1] + 1, x : columns[-1] + 1].copy()
         origin = self.origin + self.resolution * np.array([x, y])
-        return OccupancyGrid.of(part, origin, self.resolution, self.evidence)
+        cropped = OccupancyGrid.of(part, origin, self.resolution, self.evidence)
+        if self.hits is not None:
+            cropped.hits = self.hits[y : rows[-1] + 1, x : columns[-1] + 1].copy()
+        return cropped
+
+    def finished(self) -> "OccupancyGrid":
+        """Return the part of which something is known, in less memory, to be added to no more."""
+        finished = self.cropped()
+        if finished.hits is not None:
+            mean = finished.hits / np.maximum(finished.hits[:, :, 2:], 1.0)
+            finished.hits = np.round(255.0 * mean).astype(np.uint8)
+        return finished
 
     def _hold(self, points: Array) -> None:
         """Grow until points (N, 2) lie inside."""
@@ -212,7 +225,8 @@ class OccupancyGrid:
         self.log_odds = _moved(self.log_odds, before, size)
         self._marks = _moved(self._marks, before, size)
         if self.hits is not None:
-            self.hits = _moved(self.hits, before, size)
+            hits: NDArray[np.float32] = self.hits
+            self.hits = _moved(hits, before, size)
         self.origin = self.origin - self.resolution * before
 
 
@@ -256,7 +270,7 @@ def find_box(points: Array, box: Array) -> bool:
 
 
 @kernel
-def sum_hits(hits: Cells, ends: Array) -> None:
+def sum_hits(hits: Hits, ends: Array) -> None:
     """Σ (x, y, 1) of points in their cells."""
     for i in range(len(ends)):
         x, y = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.grid import Cells, OccupancyGrid
+from odomap.lidar.grid import Cells, Hits, OccupancyGrid
 
 __all__ = ["GridMatch", "match_to_grid"]
 
@@ -41,7 +41,7 @@ LINE = 0.02
 """Standard deviation of a point across the line through the mean of a cell, metres."""
 OFF_LINE = 3.0
 """How many of these off it counts half: it may be of another surface."""
-IN_COMMON_LINES = 0.04, 0.0005
+IN_COMMON_LINES = 0.06, 0.0007
 """What all points of a scan are off by together then: in cells, in radians."""
 REFINED = 6
 STEPS = 20
@@ -234,7 +234,7 @@ def match_kernel(
 
 @kernel
 def nearest_mean(
-    log_odds: Cells, hits: Cells, u: float, v: float, column: int, row: int, mean: Array
+    log_odds: Cells, hits: Hits, u: float, v: float, column: int, row: int, mean: Array
 ) -> bool:
     """mean ← that of the occupied cell beside (column, row) that is nearest to (u, v), in cells."""
     best = 2.0 * 2.0
@@ -242,7 +242,8 @@ def nearest_mean(
         for x in range(max(column - 1, 0), min(column + 2, log_odds.shape[1])):
             if log_odds[y, x] <= 0.0 or hits[y, x, 2] <= 0.0:
                 continue
-            m_x, m_y = x + hits[y, x, 0] / hits[y, x, 2], y + hits[y, x, 1] / hits[y, x, 2]
+            count = float(hits[y, x, 2])
+            m_x, m_y = x + hits[y, x, 0] / count, y + hits[y, x, 1] / count
             apart = (m_x - u) ** 2 + (m_y - v) ** 2
             if apart < best:
                 best, mean[0], mean[1] = apart, m_x, m_y
@@ -252,7 +253,7 @@ def nearest_mean(
 @kernel
 def refine_kernel(
     log_odds: Cells,
-    hits: Cells,
+    hits: Hits,
     origin: Array,
     resolution: float,
     points: Array,
@@ -304,4 +305,5 @@ def warm_up() -> None:
     grid = OccupancyGrid(0.1, keeps_hits=True)
     points = np.array([[0.3, 0.1], [0.3, -0.1]])
     grid.insert(np.zeros(2), points)
-    match_to_grid(grid, points, np.array([[1.0, 0.0], [0.0, 0.0]]), np.zeros(3), np.eye(3))
+    for each in (grid, grid.finished()):
+        match_to_grid(each, points, np.array([[1.0, 0.0], [0.0, 0.0]]), np.zeros(3), np.eye(3))

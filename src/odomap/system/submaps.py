@@ -123,7 +123,7 @@ class Submaps:
     def finish(self) -> None:
         """Finish the older of the active submaps."""
         full = self.active.pop(0)
-        full.grid = full.grid.cropped()
+        full.grid = full.grid.finished()
         self.finished.append(full)
 
     def stay(self, submap: Submap, x_anchor_body: Array, covariance: Array) -> None:
@@ -175,7 +175,7 @@ class Submaps:
                 scan = self._map.keyframe(k).scan if self._map.is_keyframe_alive(k) else None
                 if scan is not None:
                     submap.insert(k, beams.points(scan), x)
-            submap.grid = submap.grid.cropped()
+            submap.grid = submap.grid.finished()
             self.finished.append(submap)
 
     def move(self, motion: Array, noise: Array) -> None:

@@ -8,13 +8,21 @@ cell thick and would fade. The scale is 1, 2 or 5 times a power of ten, a sixth 
 Reference: E. Tufte, "The visual display of quantitative information", 1983 (no more ink than data).
 """
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from odomap.files.atomic import write_bytes
+from odomap.files.grids import save_grid
 from odomap.lidar.grid import OccupancyGrid
 from odomap.views.style import PALETTE
 
-__all__ = ["grid_picture", "grid_png"]
+if TYPE_CHECKING:
+    from odomap.maps.occupancy import GridMap
+
+__all__ = ["grid_picture", "grid_png", "write_grid"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -68,6 +76,27 @@ def grid_png(grid: OccupancyGrid, path: ArrayLike | None = None) -> bytes:
     picture = grid_picture(grid, path)
     _, data = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]))
     return bytes(data)
+
+
+def write_grid(file: str | Path, made: "GridMap", picture: bool = True) -> tuple[Path, ...]:
+    """Write a grid as YAML and PGM, and as a picture with the path.
+
+    Args:
+        file: ends in `.yaml`.
+        made: the grid.
+        picture: whether to write the PNG.
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputError: one cannot be written.
+    """
+    written = list(save_grid(file, made.grid))
+    if picture:
+        written.append(Path(file).with_suffix(".png"))
+        write_bytes(written[-1], grid_png(made.grid, made.path))
+    return tuple(written)
 
 
 def _greys(grid: OccupancyGrid) -> Image:
