@@ -20,7 +20,6 @@ from odomap.sensors.rig import LidarMount, Rig
 from odomap.system.config import Config, preset
 from odomap.system.path import Path
 from odomap.system.scantracking import ScanTracker
-from odomap.system.slam import Slam
 from odomap.system.stages import Closer, Stages
 from odomap.system.submaps import Submaps
 from odomap.system.system import System
@@ -29,7 +28,7 @@ from odomap.vision.vocabulary import VocabularyTree
 __all__ = ["LaserSlam"]
 
 
-class LaserSlam(Slam):
+class LaserSlam(System):
     """Simultaneous localisation and mapping with the first 2D laser of a rig.
 
     Args:
@@ -62,7 +61,7 @@ class LaserSlam(Slam):
         self._config = preset("lidar2d") if config is None else config
         self._beams = Beams(laser_of(rig), self._config.scan)
         self._is_mapping = is_mapping
-        System.__init__(self, self._config.threads, rhythm, map)
+        super().__init__(self._config.threads, rhythm, map)
 
     def _make_stages(self) -> Stages:
         config = self._config

@@ -10,7 +10,7 @@ What the configuration says of the sensors decides which system it is: that of c
 (`visualslam`) or that of a 2D laser (`laserslam`). What they share is in `system`.
 """
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
@@ -48,7 +48,7 @@ class Slam(System):
         InputError: the vocabulary that the configuration names cannot be used.
     """
 
-    if TYPE_CHECKING:  # of the kinds
+    if TYPE_CHECKING:  # what it makes is one of the two kinds
 
         def __init__(
             self,
@@ -65,14 +65,13 @@ class Slam(System):
         @property
         def _path(self) -> Path: ...
 
-    def __new__(cls, rig: Rig, config: Config | None = None, *args: Any, **kwargs: Any) -> Self:
+    def __new__(cls, rig: Rig, config: Config | None = None, *args: Any, **kwargs: Any) -> System:  # type: ignore[misc]
         """Return the system for the sensors that the configuration says."""
-        if cls is not Slam:
-            return object.__new__(cls)
         chosen = preset(preset_for(rig)) if config is None else config
-        kind: type[Slam]
         if chosen.tracking.sensors == LASER:
-            from odomap.system.laserslam import LaserSlam as kind
-        else:
-            from odomap.system.visualslam import VisualSlam as kind
-        return object.__new__(kind)  # type: ignore[return-value]
+            from odomap.system.laserslam import LaserSlam
+
+            return LaserSlam(rig, chosen, *args, **kwargs)
+        from odomap.system.visualslam import VisualSlam
+
+        return VisualSlam(rig, chosen, *args, **kwargs)

@@ -26,7 +26,6 @@ from odomap.system.maptracking import MapTracker
 from odomap.system.path import Path
 from odomap.system.recognisedstart import RecognisedStart
 from odomap.system.recognition import Recognizer
-from odomap.system.slam import Slam
 from odomap.system.stages import Adjuster, Closer, Stages
 from odomap.system.starting import make_start
 from odomap.system.visual import Sight, VisualSystem
@@ -35,8 +34,8 @@ from odomap.vision.vocabulary import VocabularyTree
 __all__ = ["VisualSlam"]
 
 
-class VisualSlam(VisualSystem, Slam):
-    """Simultaneous localisation and mapping with the cameras of a rig; see `Slam`."""
+class VisualSlam(VisualSystem):
+    """Simultaneous localisation and mapping with the cameras of a rig; see `slam.Slam`."""
 
     def __init__(
         self,
@@ -51,7 +50,7 @@ class VisualSlam(VisualSystem, Slam):
         self._is_mapping = is_mapping
         named = config.places.vocabulary or None
         self._words = Vocabulary.load(named) if vocabulary is None else vocabulary
-        VisualSystem.__init__(self, Sight.of(rig, config), config, rhythm, map)
+        super().__init__(Sight.of(rig, config), config, rhythm, map)
 
     def _stages(self, sight: Sight, config: Config) -> Stages:
         eye, ranger = sight.eye, sight.ranger
