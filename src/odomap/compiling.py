@@ -75,9 +75,11 @@ def compile_modules(names: Iterable[str], tell: Tell) -> None:
     calls = _calls(names)
     left, total, helpers = list(calls), len(calls), 0
     while left and not helpers:
-        tell(total - len(left), total, left[0])
-        kernels.warm_up(left[0])
-        if _has_compiled(left.pop(0)) and len(left) > FEW:
+        name = left.pop(0)
+        tell(total - len(left) - 1, total, name)
+        before = _num_compiled(name)
+        kernels.warm_up(name)
+        if _num_compiled(name) > before and len(left) > FEW:
             helpers = _num_helpers()
     if not left:
         return
@@ -224,10 +226,10 @@ def _num_helpers() -> int:
     return most if most > 1 else 0
 
 
-def _has_compiled(name: str) -> bool:
-    """Whether kernels of a module were compiled by now, and kept where other processes may, too."""
+def _num_compiled(name: str) -> int:
+    """Count the kernels of a module compiled by now, and kept where other processes may, too."""
     found = [k for k in vars(sys.modules[name]).values() if is_safe(k)]
-    return any(k.stats.cache_misses for k in found)
+    return sum(sum(k.stats.cache_misses.values()) for k in found)
 
 
 def _calls(wanted: list[str]) -> dict[str, set[str]]:
@@ -235,7 +237,8 @@ def _calls(wanted: list[str]) -> dict[str, set[str]]:
 
     The order is that of list scheduling: first come those on which most source code waits.
     """
-    package = {n: m for n, m in sys.modules.items() if n.startswith("odomap.")}
+    rooms = tuple({name.partition(".")[0] + "." for name in wanted})
+    package = {n: m for n, m in sys.modules.items() if n.startswith(rooms)}
     imports = {name: _imported(module) & set(package) for name, module in package.items()}
     calls = {name: _reached(name, imports) & set(wanted) for name in wanted}
     size = {name: Path(str(package[name].__file__)).stat().st_size for name in wanted}
