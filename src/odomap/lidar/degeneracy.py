@@ -11,7 +11,7 @@ normals are noisy: one tilted by δ (`normals`) speaks for its own tangent plane
 ten thousand make a corridor look known. That, (1/σ²) Σ f δ² Jᵀ(I - n nᵀ) J, is subtracted.
 A motion moves points by Σ f |J ξ|² = ξᵀ K ξ, and across the surface by σ² ξᵀ I ξ; an eigenvalue of
 σ² I against K is the share of a motion that is seen. It is weak where less than 0.1 % is seen, or
-less than may be chance, three times the share of the noise.
+less than may be chance, three times the share of the noise; in I it counts for nothing.
 
 Errors are taken for independent; where pairs share what the model does not say (edges, curvature,
 motion within a sweep) a motion is less sure than I says. Simulated rooms: the square of the error
@@ -98,7 +98,8 @@ def judge(
     chance = np.einsum("ji,jk,ki->i", axes, inverse @ noise @ inverse.T, axes)
     is_weak = shares < LEAST_SHARE + NOISE_FACTOR * chance
     weak = _parted((inverse.T @ axes).T[is_weak], 2 if planar else 3)
-    root = L @ axes * np.sqrt(shares)
+    # What may be chance is no information: whoever fuses with it would be led astray.
+    root = L @ axes * np.sqrt(np.where(is_weak, 0.0, shares))
     shift = np.eye(6)
     shift[:3, 3:] = -hat(origin)
     root = shift[np.ix_(free, free)].T @ root
