@@ -146,7 +146,7 @@ def test_several_loops_are_numbered_as_in_the_table(report_of: Make) -> None:
     assert [t.get_text() for t in figure.axes[0].texts] == ["1", "2"]
     assert "loop 2 close up" in figure.axes[2].get_title(loc="left")
     body = loops_section(report_of(4, trajectory=path, truth=None, loops=view))
-    assert "2 loops were closed. Loop 2 moved the path most: at 19.5 s the camera was back" in body
+    assert "2 loops were closed. Loop 2 moved the path most: at 19.5 s it was back" in body
     assert '<td>2</td><td><span class="unbroken">19.50 s (frame 195)</span></td>' in body
 
 

@@ -23,6 +23,8 @@ __all__ = ["ENDS", "draw_loops", "loops_figure"]
 Array = NDArray[np.float64]
 
 PATH_POINTS = 1500
+MANY, FINEST = 12, 0.2
+"""More loops are drawn finer, down to this part of width and ink."""
 NUMBERED = 9
 """At most so many loops have their numbers beside them."""
 NEAR = 0.35
@@ -102,7 +104,9 @@ class _Panel:
 
 
 def draw_loops(ax: Axes, pairs: Array, dots: float = 3.2) -> None:
-    """Draw loops as lines from where the camera came back (dot) to where it had been (ring).
+    """Draw loops as lines from where it came back (dot) to where it had been (ring).
+
+    The more there are, the finer: a laser closes hundreds, and the path is to be seen below.
 
     Args:
         ax: where to.
@@ -111,13 +115,14 @@ def draw_loops(ax: Axes, pairs: Array, dots: float = 3.2) -> None:
     """
     if not len(pairs):
         return
+    fine = float(np.clip((MANY / len(pairs)) ** 0.5, FINEST, 1.0))
     line = np.concatenate([pairs, np.full((len(pairs), 1, 2), np.nan)], axis=1).reshape(-1, 2)
-    style = {"color": PALETTE["loop"], "solid_capstyle": "round", "zorder": 7}
-    ax.plot(*line.T, lw=1.6, label="loop", **style)  # type: ignore[arg-type]
-    style |= {"marker": "o", "ls": "", "ms": dots, "zorder": 8}
+    style = {"color": PALETTE["loop"], "solid_capstyle": "round", "zorder": 7, "alpha": fine}
+    ax.plot(*line.T, lw=max(1.6 * fine, 0.5), label="loop", **style)  # type: ignore[arg-type]
+    style |= {"marker": "o", "ls": "", "ms": dots * fine, "mew": 1.4 * fine, "zorder": 8}
     fills = PALETTE["loop"], PALETTE["paper"]
     for k, (label, fill) in enumerate(zip(ENDS, fills)):
-        ax.plot(*pairs[:, k].T, mfc=fill, mew=1.4, label=label, **style)  # type: ignore[arg-type]
+        ax.plot(*pairs[:, k].T, mfc=fill, label=label, **style)  # type: ignore[arg-type]
 
 
 def _moved(place: Scene, points: Array) -> Array:

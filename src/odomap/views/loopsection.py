@@ -2,7 +2,8 @@
 
 Who never saw a loop should understand the picture; who looks for a false one, or for one that was
 missed, needs the numbers and the reasons. So the picture comes first, then the loops that were
-closed, then the candidates that came nearest to it, and all others folded away.
+closed, then the candidates that came nearest to it, and all others folded away: a laser closes
+hundreds.
 """
 
 import math
@@ -16,16 +17,20 @@ from odomap.views.scene import scene
 
 __all__ = ["loops_section"]
 
+FIRST = 10
+"""Closed loops that are shown at once."""
 FEW = 8
-"""Rejected candidates that are shown at once."""
+"""Rejected candidates that are."""
 MOST = 500
 """Rows of a table at most."""
 WHAT = (
-    "A loop is a place that the camera saw before. Until it comes back there, small errors add up "
-    "unnoticed; there they show, and closing the loop moves the path so that both visits agree."
+    "A loop is a place that was passed before. Until the path comes back there, small errors add "
+    "up unnoticed; there they show, and closing the loop moves the path so that both visits agree."
 )
 NONE = "No place looked like one seen before, but for those that tracking knew again by itself."
-INLIERS = "Points of both visits that agree with one position of the two cameras"
+INLIERS = (
+    "Points of both visits, or beams of a laser, that agree with how the two lie to each other"
+)
 
 
 def loops_section(report: Report) -> str:
@@ -38,7 +43,7 @@ def loops_section(report: Report) -> str:
         return f'<p>{NONE}</p><p class="note">{WHAT}</p>'
     parts = [f'<p class="note">{WHAT}</p>', _plan(report, view)]
     if log.closed:
-        parts.append(f"<h3>Closed</h3>{_closed(log, view.scale, report.unit)}")
+        parts.append(_closed(log, view.scale, report.unit))
     if log.rejected:
         parts.append(_rejected(log))
     return "\n".join(filter(None, parts))
@@ -56,8 +61,8 @@ def _plan(report: Report, view: LoopView) -> str:
     svg = figure_svg(figure, "The path before and after its loops were closed")
     caption = (
         "On the left the path as it was tracked, until the last loop was found; on the right as it "
-        "is known at the end, with what it was before as a pale line. A dot is where the camera "
-        "came back, and a ring where it had been."
+        "is known at the end, with what it was before as a pale line. A dot is where it came back, "
+        "and a ring where it had been."
     )
     return (
         f"<p>{text(_summary(view, report.unit))}</p>"
@@ -71,7 +76,7 @@ def _summary(view: LoopView, unit: str) -> str:
     loop = log.closed[n]
     head = f"{len(log.closed)} loops were closed. Loop {n + 1} moved the path most"
     head = "One loop was closed" if len(log.closed) == 1 else head
-    back = f"at {log.seconds(loop.stamp_ns):.1f} s the camera was back where it had been"
+    back = f"at {log.seconds(loop.stamp_ns):.1f} s it was back where it had been"
     when = (
         "in the map before"
         if loop.matched_frame < 0
@@ -86,8 +91,20 @@ def _length(metres: float, unit: str) -> str:
 
 
 def _closed(log: LoopLog, scale: float, unit: str) -> str:
+    """Return the loops that were closed: the first ones at once, all of them folded."""
+    closed = log.closed
+    title = f"<h3>Closed ({len(closed):,})</h3>"
+    if len(closed) <= FIRST:
+        return f"{title}{_moves(log, closed, scale, unit)}"
+    everything = _moves(log, closed[:MOST], scale, unit) + _more(len(closed))
+    first = f'<p class="note">The first {FIRST}:</p>{_moves(log, closed[:FIRST], scale, unit)}'
+    return f"{title}{first}{folded(f'All {len(closed):,}', everything)}"
+
+
+def _moves(log: LoopLog, records: Sequence[LoopRecord], scale: float, unit: str) -> str:
+    """Return what the first of the closed loops did."""
     rows = []
-    for n, loop in enumerate(log.closed[:MOST], 1):
+    for n, loop in enumerate(records, 1):
         merged = ["two pieces of the map became one"] if loop.merges else []
         said = "; ".join([*merged, *log.remarks(loop)])
         moved = _length(scale * loop.moved, unit), f"{math.degrees(loop.turned):.2g}°"
@@ -97,6 +114,11 @@ def _closed(log: LoopLog, scale: float, unit: str) -> str:
     head = ["", "Back at", "had been there at", _inliers(), "path moved", "turned"]
     head += [] if log.is_metric else ["rescaled"]
     return table([*head, ""], rows, numbers=range(3, len(head)))
+
+
+def _more(count: int) -> str:
+    hidden = count - MOST
+    return f'<p class="note">… and {hidden:,} more, in loops.json.</p>' if hidden > 0 else ""
 
 
 def _rejected(log: LoopLog) -> str:
@@ -111,9 +133,8 @@ def _rejected(log: LoopLog) -> str:
     if len(refused) <= FEW:
         return f'{title}<p class="note">{note}</p>{_reasons(log, refused)}'
     note += f"Those {FEW} with the most inliers:"
-    hidden = len(refused) - MOST
-    more = f'<p class="note">… and {hidden} more, in loops.json.</p>' if hidden > 0 else ""
-    everything = folded(f"All {len(refused):,}", _reasons(log, refused[:MOST]) + more)
+    everything = _reasons(log, refused[:MOST]) + _more(len(refused))
+    everything = folded(f"All {len(refused):,}", everything)
     return f'{title}<p class="note">{note}</p>{_reasons(log, near)}{everything}'
 
 
@@ -127,7 +148,7 @@ def _inliers() -> str:
 
 
 def _ends(log: LoopLog, loop: LoopRecord) -> list[str]:
-    """Return when the camera came back, and when it had been there."""
+    """Return when it came back, and when it had been there."""
     return [
         _end(log, loop.frame, loop.stamp_ns, loop.keyframe_id),
         _end(log, loop.matched_frame, loop.matched_stamp_ns, loop.matched_id),

@@ -68,7 +68,7 @@ def _tied(view: "MapView") -> str:
     """Say what loops and gaps are, where there are any."""
     words = ""
     if len(view.loops):
-        words += " A loop leads from where the camera came back (dot) to where it had been (ring)."
+        words += " A loop leads from where it came back (dot) to where it had been (ring)."
     if len(view.gaps):
         words += " Dotted lines join pieces whose place to each other was never measured."
     return words
@@ -101,7 +101,7 @@ def _grown(report: Report, growth: Growth) -> str:
     left = int(growth.keyframes[-1])
     return (
         f"Keyframes: {before}made, {made:,}; in the map after the last frame, {left:,}. "
-        "Where the lines are flat, the camera found what it knew."
+        "Where the lines are flat, what was seen was known."
     )
 
 

@@ -109,8 +109,10 @@
     } else
       for (const [from, to] of data.pieces)
         for (let i = from; i < to; i++) { ctx.strokeStyle = colours[i + 1]; line(path, i, i + 1); }
-    ctx.strokeStyle = palette.loop; ctx.lineWidth = 2.5;
+    const fine = Math.min(1, Math.max(0.2, Math.sqrt(12 * 6 / Math.max(loops.length, 1))));
+    ctx.strokeStyle = palette.loop; ctx.lineWidth = Math.max(2.5 * fine, 0.8); ctx.globalAlpha = fine;
     for (let i = 0; i < loops.length / 3; i += 2) line(loops, i, i + 1);
+    ctx.globalAlpha = 1;
     ctx.fillStyle = palette.keyframe;
     for (const i of data.keyframes) {
       const [u, v] = project(path[3 * i], path[3 * i + 1], path[3 * i + 2]);
