@@ -69,3 +69,27 @@ def test_a_scan_of_another_scanner_is_refused():
 def test_an_empty_scan_has_no_points(ranges):
     scan = Beams(mount()).points(ranges)
     assert len(scan.hits) == len(scan.between) == 0
+
+
+def test_a_wall_has_its_normal_to_where_it_ends_in_view():
+    # One that is seen to the side ends where the view does, and that end moves with the scanner:
+    # without a normal it would say how far along the wall it is.
+    angles = np.linspace(*ANGLES)
+    ranges = np.abs(1.0 / np.sin(np.minimum(angles, -1e-9)))  # a wall 1 m to the right
+    ranges[angles > -0.2] = np.nan
+    wall = Beams(mount()).points(ranges)
+    np.testing.assert_allclose(np.abs(wall.normals[:-1]), [[0.0, 1.0]] * (len(wall) - 1), atol=1e-9)
+
+
+def test_each_wall_has_its_normal_up_to_a_corner_which_has_none():
+    angles = np.linspace(*ANGLES)
+    with np.errstate(divide="ignore"):
+        ahead = np.where(np.abs(angles) < 1.5, 2.0 / np.cos(angles), np.inf)
+        right = np.where(angles < 0, -2.0 / np.sin(angles), np.inf)
+    scan = Beams(mount(range_m=(0.1, 5.0))).points(np.minimum(ahead, right))
+    apart = np.linalg.norm(scan.hits - [2.0, -2.0], axis=1)
+    assert not scan.normals[apart < 1e-6].any()
+    inside = (apart > 0.1) & (np.abs(scan.hits[:, 1]) < 4)
+    is_ahead = np.isclose(scan.hits[:, 0], 2.0)
+    along_x = np.where(is_ahead[:, None], [1.0, 0.0], [0.0, 1.0])
+    np.testing.assert_allclose(np.abs(scan.normals[inside]), along_x[inside], atol=1e-6)

@@ -61,11 +61,10 @@ class GridPyramid:
         part = grid.cropped()
         self.resolution, room = grid.resolution, 1 << levels
         self._origin = part.origin - room * grid.resolution
-        height, width = part.log_odds.shape
+        walls = is_wall(part)
+        height, width = walls.shape
         self._levels: Levels = np.zeros((levels + 1, height + room, width + room), np.uint8)
-        self._levels[0, room:, room:] = np.maximum(
-            FULL * is_wall(part), HALF * beside(is_wall(part))
-        )
+        self._levels[0, room:, room:] = np.where(walls, FULL, HALF * beside(walls))
         for h in range(levels):
             widen(self._levels[h], 1 << h, self._levels[h + 1])
 
@@ -109,17 +108,12 @@ class GridPyramid:
         return Found(found, total / full)
 
 
-@kernel
 def widen(level: Levels, by: int, wider: Levels) -> None:
     """wider(c) ← max of level at c, c + (by, 0), c + (0, by), c + (by, by)."""
-    height, width = level.shape
-    for y in range(height):
-        below = min(y + by, height - 1)
-        for x in range(width):
-            right = min(x + by, width - 1)
-            wider[y, x] = max(
-                max(level[y, x], level[y, right]), max(level[below, x], level[below, right])
-            )
+    across = level.copy()
+    np.maximum(level[:, :-by], level[:, by:], out=across[:, :-by])
+    wider[:] = across
+    np.maximum(across[:-by], across[by:], out=wider[:-by])
 
 
 @kernel

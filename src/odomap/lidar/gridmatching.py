@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 SIGMA = 0.5
 """Standard deviation of 1 - m where a point lies on a wall."""
-ON_WALL = 0.1
+ON_WALL = 0.03
 """Least m of a point that lies on one: a single hit is enough."""
 IN_COMMON = 0.25, 0.002
 """Standard deviation of what all points of a scan are off by together: in cells, in radians."""

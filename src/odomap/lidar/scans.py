@@ -132,33 +132,64 @@ def _between(p: Array, is_one: Mask, spacing: float) -> Array:
 
 
 @kernel
+def way_along(
+    p: Array, is_hit: Mask, is_one: Mask, i: int, by: int, baseline: float, straight: float
+) -> tuple[float, float, int]:
+    """Return the way from p_i along its surface to one side, and what that is: 2 where points in
+    between lie on it, 1 where it leads to the next beam only, 0 where the surface ends or bends.
+
+    by is 1 or -1; the way is at least a baseline long, but for the next beam across a gap: beams
+    too wide apart to be of one surface still are of one line where they are straight.
+    """
+    end, x, y = i, 0.0, 0.0
+    while 0 <= end + by < len(p) and is_one[min(end, end + by)] and x * x + y * y < baseline**2:
+        end += by
+        x, y = p[end, 0] - p[i, 0], p[end, 1] - p[i, 1]
+    if end == i:
+        if not (0 <= i + by < len(p) and is_hit[i + by]):
+            return 0.0, 0.0, 0
+        return p[i + by, 0] - p[i, 0], p[i + by, 1] - p[i, 1], 1
+    length = np.hypot(x, y)
+    for k in range(i + by, end, by):
+        a, b = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1]
+        if np.hypot(a, b) > 0.5 * length and a * x + b * y < straight * np.hypot(a, b) * length:
+            return x, y, 0
+    if length < 0.3 * baseline:
+        return x, y, 0
+    return x, y, 1 if abs(end - i) == 1 else 2
+
+
+@kernel
 def find_normals(
     p: Array, is_hit: Mask, is_one: Mask, baseline: float, straight: float, normals: Array
 ) -> None:
-    """n ⊥ p_r - p_l, the first points of the surface at least a baseline to either side of p_i,
-    where the ways to both are straight: cos of the angle between them. Beams too wide apart to
-    be of one surface still are of one line where they are straight."""
-    for i in range(1, len(p) - 1):
-        left, right = i, i
-        while left > 0 and is_one[left - 1]:
-            left -= 1
-            if np.hypot(p[left, 0] - p[i, 0], p[left, 1] - p[i, 1]) >= baseline:
-                break
-        while right < len(p) - 1 and is_one[right]:
-            right += 1
-            if np.hypot(p[right, 0] - p[i, 0], p[right, 1] - p[i, 1]) >= baseline:
-                break
-        left -= left == i and is_hit[i - 1]
-        right += right == i and is_hit[i + 1]
-        a_x, a_y = p[i, 0] - p[left, 0], p[i, 1] - p[left, 1]
-        b_x, b_y = p[right, 0] - p[i, 0], p[right, 1] - p[i, 1]
-        a, b = np.hypot(a_x, a_y), np.hypot(b_x, b_y)
-        least = 0.3 * baseline
-        if not is_hit[i] or a < least or b < least or a_x * b_x + a_y * b_y < straight * a * b:
+    """n ⊥ the surface at p_i, where the ways along it to both sides are straight, cos of the angle
+    between them; where it ends on one side, or bends before the baseline, ⊥ the other. At a corner
+    between two straight ways there is none, nor where too little is seen."""
+    for i in range(len(p)):
+        if not is_hit[i]:
             continue
-        x, y = a_x + b_x, a_y + b_y
-        length = np.hypot(x, y)
-        normals[i, 0], normals[i, 1] = -y / length, x / length
+        l_x, l_y, left = way_along(p, is_hit, is_one, i, -1, baseline, straight)
+        r_x, r_y, right = way_along(p, is_hit, is_one, i, 1, baseline, straight)
+        if left > 0 and right > 0:
+            along = -(l_x * r_x + l_y * r_y)
+            if along >= straight * np.hypot(l_x, l_y) * np.hypot(r_x, r_y):
+                set_normal(normals, i, r_x - l_x, r_y - l_y)
+            elif left < 2 and right == 2:
+                set_normal(normals, i, r_x, r_y)
+            elif right < 2 and left == 2:
+                set_normal(normals, i, -l_x, -l_y)
+        elif right == 2:
+            set_normal(normals, i, r_x, r_y)
+        elif left == 2:
+            set_normal(normals, i, -l_x, -l_y)
+
+
+@kernel
+def set_normal(normals: Array, i: int, x: float, y: float) -> None:
+    """n_i ← across (x, y)."""
+    length = np.hypot(x, y)
+    normals[i, 0], normals[i, 1] = -y / length, x / length
 
 
 def warm_up() -> None:

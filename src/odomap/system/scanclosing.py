@@ -3,12 +3,9 @@
 A new keyframe may show what an old, finished submap holds. How far it may have drifted from there
 is known, and in a window of that size branch and bound finds the best of all poses, or says that
 none is good enough; where it found one the scan is matched exactly. Each that holds is an edge
-between the submap's anchor and the keyframe. After some of them the path is solved anew,
-
-    min over x_k   Σ_submap |x_a⁻¹ x_k ⊖ z|²_Λ  +  Σ_loop min( |x_a⁻¹ x_k ⊖ z|²_Λ, c² ),
-
-in the plane: graduated non-convexity decides which loops the others contradict, and these are left
-out. Covariances are the graph's marginals.
+between the submap's anchor and the keyframe. After some of them the path is solved anew
+(`scangraph`). Whenever there are half as many loops again, and at the end, it is decided anew which
+of them the others contradict; these are left out until then.
 
 Cost: a search some milliseconds, two at a keyframe at most; a solution O(K).
 
@@ -23,17 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.graphs.covariances import GraphCovariances
-from odomap.backend.graphs.gnc import find_inliers
 from odomap.backend.graphs.graphproblem import import_group
-from odomap.backend.graphs.solve import solve
 from odomap.geometry.planar import (
     IN_PLANE,
     between_planar,
     from_plane,
-    lift_covariance,
     lift_information,
-    planar_matrix,
     to_plane,
     transform_planar,
 )
@@ -43,12 +35,11 @@ from odomap.lidar.scans import Beams
 from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
-from odomap.maps.snapshot import Snapshot
 from odomap.system.correction import correction
-from odomap.system.essentialgraph import EssentialGraph
 from odomap.system.scanconfig import ScanClosingConfig
+from odomap.system.scangraph import ScanGraph, ScanPath, read_graph
 from odomap.system.stages import Loop
-from odomap.system.submaps import SUBMAP, Submap, Submaps
+from odomap.system.submaps import Submap, Submaps
 
 __all__ = ["ScanCloser"]
 
@@ -57,6 +48,8 @@ Index = NDArray[np.int64]
 
 PYRAMIDS = 24
 """Submaps whose pyramids are kept."""
+MORE = 1.5
+"""How many times as many loops there must be for it to be decided anew which are true."""
 SIGMAS = 3.0
 """Standard deviations of where the keyframe is in a submap that are searched."""
 
@@ -89,18 +82,6 @@ class _Tie:
     num_on_walls: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """What is solved, read from the map: edges by ids of living keyframes."""
-
-    snapshot: Snapshot
-    i: Index
-    j: Index
-    x: Array
-    information: Array
-    is_loop: NDArray[np.bool_]
-
-
 class ScanCloser:
     """The closer of SLAM with a 2D laser.
 
@@ -117,6 +98,8 @@ class ScanCloser:
         self._tied: dict[int, int] = {}
         self._since_searched = self._since_solved = self._next = 0
         self._pending = 0
+        self._false: frozenset[tuple[int, int]] = frozenset()
+        self._num_loops, self._num_decided = 0, 0
         import_group("SE2")
 
     def add(self, keyframe: Keyframe) -> "ScanClosingJob | None":
@@ -127,11 +110,12 @@ class ScanCloser:
         if self._since_searched >= self._config.every and keyframe.scan is not None:
             candidates = self._candidates(keyframe)
             self._since_searched = 0
-        return self._job(keyframe, candidates, self._is_due())
+        decides = self._num_loops >= MORE * self._num_decided
+        return self._job(keyframe, candidates, self._is_due(), decides)
 
     def last(self) -> "ScanClosingJob | None":
         """Read the graph at the end of a run, if it was not solved since the last loop."""
-        return self._job(None, (), self._pending > 0)
+        return self._job(None, (), self._num_loops > 0, True)
 
     def _is_due(self) -> bool:
         least = max(self._config.solve_every, self._config.solve_share * self._map.num_keyframes)
@@ -142,13 +126,16 @@ class ScanCloser:
         keyframe: Keyframe | None,
         candidates: tuple[_Candidate, ...],
         solves: bool,
+        decides: bool,
     ) -> "ScanClosingJob | None":
         if not candidates and not solves:
             return None
-        graph = self._read_graph() if solves else None
+        graph = read_graph(self._map, self._false) if solves else None
         if graph is not None:
             self._since_solved = self._pending = 0
-        return ScanClosingJob(self, keyframe, candidates, graph)
+            if decides:
+                self._num_decided = self._num_loops
+        return ScanClosingJob(self, keyframe, candidates, graph, decides)
 
     def _candidates(self, keyframe: Keyframe) -> tuple[_Candidate, ...]:
         """Return submaps that a keyframe may be in, in turn, so that each gets its chance."""
@@ -180,24 +167,6 @@ class ScanCloser:
     def _pose(self, k: int) -> tuple[Array, Array]:
         covariance = self._map.covariance(k)[IN_PLANE[:, None], IN_PLANE]
         return to_plane(self._map.T_world_body(k)), covariance
-
-    def _read_graph(self) -> _Graph:
-        """Read the poses of living keyframes and the edges between them."""
-        with self._map.lock:
-            snapshot = self._map.snapshot(self._map.keyframe_ids, landmarks=False)
-            edges = self._map.edges()
-        kinds = np.array(edges.kind, str)
-        alive = np.isin(edges.i, snapshot.keyframe_ids) & np.isin(edges.j, snapshot.keyframe_ids)
-        used = np.flatnonzero(alive & np.isin(kinds, (SUBMAP, LOOP)))
-        plane = IN_PLANE[:, None], IN_PLANE
-        return _Graph(
-            snapshot,
-            edges.i[used],
-            edges.j[used],
-            to_plane(edges.Ts_i_j[used]),
-            edges.information[used][:, *plane],
-            kinds[used] == LOOP,
-        )
 
     # ---- without the map ----
 
@@ -251,36 +220,9 @@ class ScanCloser:
             self._pyramids.popitem(last=False)
         return pyramid
 
-    def solve(self, graph: _Graph) -> "_Solved":
-        """Find the poses that agree best with the edges."""
-        ids = graph.snapshot.keyframe_ids
-        order = np.argsort(ids)
-        sorted_ids = ids[order]
-        i, j = (np.searchsorted(sorted_ids, ends) for ends in (graph.i, graph.j))
-        x = to_plane(graph.snapshot.Ts_world_body[order])
-        is_fixed = np.zeros(len(x), bool)
-        is_fixed[0] = True
-        edges = EssentialGraph(
-            "SE2",
-            planar_matrix(x),
-            i,
-            j,
-            planar_matrix(graph.x),
-            graph.information,
-            is_fixed=is_fixed,
-            is_doubted=graph.is_loop,
-        )
-        doubts = np.where(graph.is_loop, self._config.doubt**-2, 1.0)
-        inliers = find_inliers(edges, doubts)
-        is_true = inliers.is_inlier | ~graph.is_loop
-        solution = solve(edges.placed(inliers.Ts_world_node), initial="given", weights=is_true)
-        believed = edges.without(~is_true).placed(solution.Ts_world_node)
-        covariances = GraphCovariances(believed).marginals()
-        T = solution.Ts_world_node  # rotations to the digits of a solver: made anew from headings
-        x = np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
-        Ts = from_plane(x)
-        doubted = np.stack([graph.j[~is_true], graph.i[~is_true]], axis=1)
-        return _Solved(sorted_ids, order, Ts, lift_covariance(covariances), doubted)
+    def solve(self, graph: ScanGraph, decides: bool) -> ScanPath:
+        """Find the path that agrees best with submaps and loops."""
+        return graph.solve(self._config, decides)
 
     # ---- with the map again ----
 
@@ -298,17 +240,15 @@ class ScanCloser:
             )
             self._tied[tie.submap.anchor_id] = tie.keyframe_id
             self._pending += 1
+            self._num_loops += 1
 
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """The path solved: ids ascending, their rows as read, poses, covariances, doubted loops."""
-
-    keyframe_ids: Index
-    order: Index
-    Ts_world_body: Array
-    covariances: Array
-    doubted: Index
+    def disbelieve(self, false: Index) -> None:
+        """Keep which loops (n, 2), keyframe and anchor, are contradicted by the others."""
+        now = frozenset((k, anchor) for k, anchor in false.tolist())
+        if now - self._false:
+            text = "%d loops of %d contradict the others and are not believed"
+            logging.getLogger(__name__).warning(text, len(now), self._num_loops)
+        self._false = now
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,14 +258,15 @@ class ScanClosingJob:
     closer: ScanCloser
     keyframe: Keyframe | None
     candidates: tuple[_Candidate, ...]
-    graph: _Graph | None
+    graph: ScanGraph | None
+    decides: bool
 
     def solve(self) -> "ScanClosingChange":
         """Search and solve."""
         found: list[_Tie | Loop] = []
         if self.keyframe is not None and self.candidates:
             found = self.closer.search(self.keyframe, self.candidates)
-        solved = None if self.graph is None else self.closer.solve(self.graph)
+        solved = None if self.graph is None else self.closer.solve(self.graph, self.decides)
         ties = [tie for tie in found if isinstance(tie, _Tie)]
         refused = [loop for loop in found if isinstance(loop, Loop)]
         return ScanClosingChange(self.closer, ties, refused, self.graph, solved)
@@ -338,8 +279,8 @@ class ScanClosingChange:
     closer: ScanCloser
     ties: list[_Tie]
     refused: list[Loop]
-    graph: _Graph | None
-    solved: _Solved | None
+    graph: ScanGraph | None
+    solved: ScanPath | None
 
     @property
     def loops(self) -> tuple[Loop, ...]:
@@ -375,7 +316,5 @@ class ScanClosingChange:
                     solved.covariances,
                 )
             )
-            if len(solved.doubted):
-                text = "%d loops contradict the others and are not believed"
-                logging.getLogger(__name__).warning(text, len(solved.doubted))
+            self.closer.disbelieve(solved.false)
         self.closer.tie(self.ties, map)

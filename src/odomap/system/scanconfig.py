@@ -36,12 +36,16 @@ class ScanTrackingConfig:
     """Standard deviation of a motion by odometry, relative to it."""
     veer: NotNegative = 0.05
     """The same of the heading per metre, radians."""
-    jitter: Positive = 0.02
-    """Least standard deviation of a motion, metres."""
+    jitter: Positive = 0.01
+    """Least standard deviation of a motion by odometry, metres."""
     jitter_rad: Positive = 0.01
     """The same of the heading, radians."""
     unsteady: Positive = 0.5
     """Standard deviation of a motion without odometry, relative to one as before."""
+    shake: Positive = 0.03
+    """Least standard deviation of a motion without odometry, metres."""
+    shake_rad: Positive = 0.01
+    """The same of the heading, radians."""
     search: NotNegative = 0.15
     """How far around it all poses are tried then, metres."""
     search_rad: NotNegative = 0.12
@@ -91,8 +95,10 @@ class ScanClosingConfig:
     """Keyframes after which the path is solved anew if there are new loops; in large maps more."""
     solve_share: Fraction = 0.02
     """The same, relative to all keyframes."""
-    doubt: Positive = 3.0
-    """Factor on the standard deviations of loops while it is decided which are true."""
+    doubt: Positive = 4.0
+    """Factor on all standard deviations while it is decided which loops are true: submaps bend."""
+    outlying: Positive = 10.0
+    """Standard deviations at which a loop counts half."""
 
     def __post_init__(self) -> None:
         check_limits(self)

@@ -260,16 +260,19 @@ class ScanTracker:
         seconds = max((frame.stamp_ns - self._stamp_ns) * 1e-9, 0.0)
         self._stamp_ns = max(frame.stamp_ns, self._stamp_ns)
         self._odometry = self._read_odometry(frame)
+        is_known = before is not None and self._odometry is not None
         if before is not None and self._odometry is not None:
             motion, share = between_planar(before, self._odometry), config.slip
+            least = config.jitter, config.jitter_rad
         else:
+            least = config.shake, config.shake_rad
             usual = self._step_s if self._step_s > 0.0 else seconds
             motion = self._step * (min(seconds / usual, 3.0) if usual > 0.0 else 1.0)
             share = config.unsteady
         way, turn = float(np.hypot(*motion[:2])), abs(float(motion[2]))
-        sigma = config.jitter + share * way + 0.2 * config.slip * turn
-        sigma_rad = config.jitter_rad + share * turn + config.veer * way
-        return motion, np.diag([sigma, sigma, sigma_rad]) ** 2, share == config.slip
+        sigma = least[0] + share * way + 0.2 * config.slip * turn
+        sigma_rad = least[1] + share * turn + config.veer * way
+        return motion, np.diag([sigma, sigma, sigma_rad]) ** 2, is_known
 
     def _read_odometry(self, frame: Frame) -> Array | None:
         if frame.odometry is None or not self._config.use_odometry:
