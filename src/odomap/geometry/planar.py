@@ -10,10 +10,10 @@ Reference: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relati
 robotics", Autonomous Robot Vehicles, Springer 1990.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-
-from odomap.geometry.se2 import se2_adjoint, se2_inverse
 
 __all__ = [
     "between_planar",
@@ -37,11 +37,18 @@ OFF_PLANE = 1e-3
 
 def to_plane(T: Array) -> Array:
     """Return (..., 3) x, y, heading of poses (..., 4, 4)."""
+    if T.ndim == 2:
+        return np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
     return np.stack([T[..., 0, 3], T[..., 1, 3], np.arctan2(T[..., 1, 0], T[..., 0, 0])], axis=-1)
 
 
 def from_plane(x: Array) -> Array:
     """Return poses (..., 4, 4) of (..., 3) x, y, heading."""
+    if np.ndim(x) == 1:
+        t_x, t_y, angle = x.tolist()
+        c, s = math.cos(angle), math.sin(angle)
+        zero = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        return np.array([c, -s, 0.0, t_x, s, c, 0.0, t_y, *zero]).reshape(4, 4)
     T = np.zeros((*np.shape(x)[:-1], 4, 4))
     T[..., 0, 0] = T[..., 1, 1] = np.cos(x[..., 2])
     T[..., 1, 0] = np.sin(x[..., 2])
@@ -58,14 +65,16 @@ def planar_matrix(x: Array) -> Array:
 
 def compose_planar(a: Array, b: Array) -> Array:
     """Return a ⊕ b: (3,) b, given in a, as seen from where a is given."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], _wrapped(a[2] + b[2])])
+    (x, y, angle), (b_x, b_y, turn) = a.tolist(), b.tolist()
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([x + c * b_x - s * b_y, y + s * b_x + c * b_y, _wrapped(angle + turn)])
 
 
 def between_planar(a: Array, b: Array) -> Array:
     """Return b as seen from a, (3,): a ⊕ it is b."""
-    c, s, d = np.cos(a[2]), np.sin(a[2]), b[:2] - a[:2]
-    return np.array([c * d[0] + s * d[1], -s * d[0] + c * d[1], _wrapped(b[2] - a[2])])
+    (x, y, angle), (b_x, b_y, b_angle) = a.tolist(), b.tolist()
+    c, s, d_x, d_y = math.cos(angle), math.sin(angle), b_x - x, b_y - y
+    return np.array([c * d_x + s * d_y, -s * d_x + c * d_y, _wrapped(b_angle - angle)])
 
 
 def transform_planar(x: Array, points: Array) -> Array:
@@ -76,7 +85,9 @@ def transform_planar(x: Array, points: Array) -> Array:
 
 def moved_covariance(covariance: Array, motion: Array) -> Array:
     """Return how sure (3, 3) a pose is after an exact motion (3,) of its own."""
-    Ad = se2_adjoint(se2_inverse(planar_matrix(motion)))
+    x, y, angle = motion.tolist()
+    c, s = math.cos(angle), math.sin(angle)
+    Ad = np.array([[c, s, s * x - c * y], [-s, c, c * x + s * y], [0.0, 0.0, 1.0]])
     return np.asarray(Ad @ covariance @ Ad.T)
 
 
@@ -92,10 +103,11 @@ def lift_information(information: Array) -> Array:
 
 def _lifted(matrix: Array, off_plane: float) -> Array:
     lifted = np.zeros((*np.shape(matrix)[:-2], 6, 6))
-    lifted[..., [2, 3, 4], [2, 3, 4]] = off_plane
-    lifted[..., IN_PLANE[:, None], IN_PLANE] = matrix
+    lifted[..., 2, 2] = lifted[..., 3, 3] = lifted[..., 4, 4] = off_plane
+    lifted[..., :2, :2], lifted[..., 5, 5] = matrix[..., :2, :2], matrix[..., 2, 2]
+    lifted[..., :2, 5], lifted[..., 5, :2] = matrix[..., :2, 2], matrix[..., 2, :2]
     return lifted
 
 
 def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi

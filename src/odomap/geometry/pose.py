@@ -35,6 +35,18 @@ _ROUNDING = 4e-15
 """A matrix this close is kept bit for bit, so that values survive a round trip."""
 
 
+_IDENTITY = {n: np.eye(n) for n in (2, 3, 4)}
+
+
+def _is_reflection(R: Array) -> bool:
+    """Say whether the determinant of R (2, 2) or (3, 3) is negative."""
+    if len(R) == 2:
+        (a, b), (c, d) = R.tolist()
+        return bool(a * d < b * c)
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0.0)
+
+
 def _polished(R: Array) -> Array:
     """Take one Newton step towards the nearest rotation."""
     return np.asarray(0.5 * R @ (3.0 * np.eye(R.shape[-1]) - R.T @ R))
@@ -57,7 +69,7 @@ class _Motion:
             raise InputError(f"{name}: not a matrix of numbers, give ({n}, {n})") from None
         if given.shape != (n, n):
             raise InputError(f"{name}: matrix has shape {given.shape}, give ({n}, {n})")
-        if not np.all(np.isfinite(given)):
+        if not np.isfinite(given).all():
             raise InputError(f"{name}: matrix has NaN or infinite entries")
         self._check(given)
         self._freeze(given)
@@ -65,17 +77,18 @@ class _Motion:
     def _check(self, given: Array) -> None:
         """Raise unless `given` is of the group to 1e-6, then make it so exactly, in place."""
         name, d = type(self).__name__, self._space
-        if self._size > d and np.any(np.abs(given[d] - np.eye(d + 1)[d]) > 1e-9):
+        last = _IDENTITY[self._size][d:]
+        if self._size > d and np.abs(given[d:] - last).max() > 1e-9:
             raise InputError(f"{name}: last row is {given[d].tolist()}, must be 0 … 0 1")
         scale = self._scale_of(given)
         R = given[:d, :d] / scale
-        error = float(np.max(np.abs(R.T @ R - np.eye(d))))
-        if error > _TOLERANCE or np.linalg.det(R) < 0:
+        error = float(np.abs(R.T @ R - _IDENTITY[d]).max())
+        if error > _TOLERANCE or _is_reflection(R):
             kind = "a reflection" if error <= _TOLERANCE else f"off by {error:.1e}"
             raise InputError(f"{name}: not a rotation ({kind}); transposed, or rounded too far?")
         if error > _ROUNDING:
             given[:d, :d] = scale * lie.orthonormalize(R)
-        given[d:] = np.eye(self._size)[d:]
+        given[d:] = last
 
     def _scale_of(self, given: Array) -> float:
         return 1.0

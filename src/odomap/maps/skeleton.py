@@ -131,15 +131,18 @@ class Skeleton:
         """Return the (4, 4) pose of a keyframe, also of a culled one."""
         return np.asarray(self.Ts_world_body(np.array([keyframe_id]))[0])
 
+    def placements(self, keyframe_ids: ArrayLike) -> Placement:
+        """Return the (n, 4, 4) poses and the (n,) scales of keyframes, also of culled ones."""
+        with self.lock:
+            return self._tree.placements(self.states, self._all_known(keyframe_ids))
+
     def Ts_world_body(self, keyframe_ids: ArrayLike) -> NDArray[np.float64]:
         """Return the (n, 4, 4) poses of keyframes, also of culled ones."""
-        with self.lock:
-            return self._tree.placements(self.states, self._all_known(keyframe_ids))[0]
+        return self.placements(keyframe_ids)[0]
 
     def scale(self, keyframe_id: int) -> float:
         """Return the world units per unit of a keyframe, also of a culled one."""
-        with self.lock:
-            return float(self._placement(keyframe_id)[1])
+        return float(self._placement(keyframe_id)[1])
 
     def place(self, keyframe_id: int, T_keyframe_body: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of a frame that hangs from a keyframe, also from a culled one.
@@ -173,6 +176,11 @@ class Skeleton:
         """Return the (6, 6) covariance of a keyframe's pose, right tangent; NaN where unknown."""
         with self.lock:
             return np.array(self.states.covariances[self._known(keyframe_id)])
+
+    def covariances(self, keyframe_ids: ArrayLike) -> NDArray[np.float64]:
+        """Return the (n, 6, 6) covariances of keyframes' poses; NaN where unknown."""
+        with self.lock:
+            return np.array(self.states.covariances[self._all_known(keyframe_ids)])
 
     def set_covariance(self, keyframe_ids: ArrayLike, covariances: NDArray[np.float64]) -> None:
         """Write the (n, 6, 6) covariances, or one (6, 6), of keyframes."""
@@ -248,6 +256,9 @@ class Skeleton:
     def _placement(self, keyframe_id: int) -> Placement:
         """Return the (4, 4) pose and the scale of a keyframe, also of a culled one."""
         with self.lock:
+            if self._tree.status_of(keyframe_id) == ALIVE:  # nearly all: asked for at every frame
+                states = self.states
+                return states.Ts_world_body[keyframe_id].copy(), states.scales[keyframe_id]
             Ts, scales = self._tree.placements(self.states, self._all_known([keyframe_id]))
         return Ts[0], scales[0]
 

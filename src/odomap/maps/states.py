@@ -71,6 +71,8 @@ def stretched(
         covariances: in some units.
         by: (...) how many of the other units one of these is.
     """
+    if isinstance(by, float) and by == 1.0:
+        return np.array(covariances)
     units = np.ones((*np.shape(by), 6))
     units[..., :3] = np.asarray(by)[..., None]
     return np.asarray(covariances * units[..., :, None] * units[..., None, :])

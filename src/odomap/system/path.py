@@ -10,15 +10,18 @@ the world its covariance is that of its keyframe, carried over, plus that of the
 Reference: Barfoot, Furgale, "Associating Uncertainty With Three-Dimensional Poses", T-RO 2014.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_adjoint, se3_inverse, se3_log
+from odomap.geometry.lie_kernels import se3_log_into
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.map import Map
-from odomap.maps.states import stretched
+from odomap.maps.states import compose, stretched
 
 __all__ = ["ASTRAY", "Path", "Placed"]
 
@@ -58,6 +61,8 @@ class Path:
         self._live: list[tuple[int, Array, Array]] = []
         self._relative = np.zeros((6, 6))
         self._fastest, self._units = np.zeros(2), 1.0
+        # The last frame as known when the map was of this version.
+        self._T_last, self._scale_last, self._version = np.eye(4), 1.0, -1
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -87,13 +92,16 @@ class Path:
 
     def append(self, frame: Placed) -> tuple[Array, Array]:
         """Add a frame; return its pose (4, 4) and covariance (6, 6) in the world as known now."""
+        before = self._known_last()[0]
         self._measure_speeds_by(frame)
-        self._frames.append(frame)
-        self._relative = stretched(frame.covariance, self._units)
-        T_world_body, covariance = self._pose(frame), self.covariance(frame)
+        self._add(frame)
+        T_world_body, scale = self._known_last()
+        self._relative = stretched(frame.covariance, scale)
+        covariance = self.covariance(frame)
         self._live.append((frame.stamp_ns, T_world_body, covariance))
-        speed = np.linalg.norm(self.velocity().reshape(2, 3), axis=1)
-        self._fastest = np.maximum(self._fastest, speed)
+        seconds = self._last_seconds()
+        if seconds > 0.0:
+            self._fastest = np.maximum(self._fastest, _lengths(before, T_world_body) / seconds)
         return T_world_body, covariance
 
     def replace_last(self, frame: Placed) -> None:
@@ -104,16 +112,16 @@ class Path:
         """Hang one of the frames anew."""
         if place == len(self) - 1:
             self._measure_speeds_by(frame)
-        self._frames[place] = frame
+        self._frames[place], self._version = frame, -1
 
     def append_late(self, frame: Placed) -> None:
         """Add a frame that could not be placed when it came; it is no part of the live path."""
         self._measure_speeds_by(frame)
-        self._frames.append(frame)
+        self._add(frame)
 
     def last_pose(self) -> Array:
         """Return the last frame's T_world_body (4, 4) as known now; identity if there is none."""
-        return self._pose(self._frames[-1]) if self._frames else np.eye(4)
+        return self._known_last()[0].copy()
 
     def is_leap(self, T_expected: Array, T_found: Array, covariance: Array) -> bool:
         """Say whether a pose (4, 4) lies further from where it was expected than a body can move.
@@ -134,8 +142,8 @@ class Path:
         """Say in a sentence if the map has been corrected so that the last pose leapt; else ""."""
         if not self._live or self._live[-1][0] != self.last.stamp_ns:
             return ""
-        then, now = self._live[-1][1], self._pose(self.last)
-        if not self.is_leap(then, now, self._relative):
+        then, now = self._live[-1][1], self._known_last()[0]
+        if now is then or not self.is_leap(then, now, self._relative):
             return ""
         return f"the map was corrected: the last pose moved by {_lengths(then, now)[0]:.2g}"
 
@@ -145,21 +153,16 @@ class Path:
 
     def velocity(self) -> Array:
         """Return the twist (6,) between the last two frames, per second; zero if they are apart."""
-        if len(self._frames) < 2:
+        seconds = self._last_seconds()
+        if seconds <= 0.0:
             return np.zeros(6)
-        before, last = self._frames[-2:]
-        dt = (last.stamp_ns - before.stamp_ns) * 1e-9
-        if not 0.0 < dt <= 1.0:
-            return np.zeros(6)
-        return np.asarray(se3_log(se3_inverse(self._pose(before)) @ self._pose(last)) / dt)
+        T_before, T_last = self._pose(self._frames[-2]), self._known_last()[0]
+        return np.asarray(se3_log(se3_inverse(T_before) @ T_last) / seconds)
 
     def covariance(self, frame: Placed) -> Array:
         """Return the covariance (6, 6) in the world of a frame that hangs from a keyframe."""
-        scale, T_keyframe_body = self._map.scale(frame.keyframe_id), frame.T_keyframe_body.copy()
-        T_keyframe_body[:3, 3] *= scale
-        Ad = se3_adjoint(se3_inverse(T_keyframe_body))
-        carried = Ad @ self._map.covariance(frame.keyframe_id) @ Ad.T
-        return np.asarray(carried + stretched(frame.covariance, scale))
+        scale, sure = self._map.scale(frame.keyframe_id), self._map.covariance(frame.keyframe_id)
+        return _in_world(sure, scale, frame.T_keyframe_body, frame.covariance)
 
     def gap_covariance(self, stamp_ns: int) -> Array:
         """Return how unsure the last pose (6, 6) is by now: a metre and half a radian a second."""
@@ -171,7 +174,7 @@ class Path:
 
     def trajectory(self) -> Trajectory:
         """Return T_world_body of all frames as known now, with covariances."""
-        return _trajectory([(f.stamp_ns, self._pose(f), self.covariance(f)) for f in self._frames])
+        return self._known(self._frames)
 
     def keyframes(self) -> Trajectory:
         """Return the keyframes among the frames, those that hang from themselves, as known now."""
@@ -181,12 +184,16 @@ class Path:
             if self._map.is_keyframe_alive(f.keyframe_id)
             and self._map.keyframe(f.keyframe_id).stamp_ns == f.stamp_ns
         ]
-        rows = [(f.stamp_ns, self._pose(f), self.covariance(f)) for f in keyframes]
-        return _trajectory(rows)
+        return self._known(keyframes)
 
     def trajectory_live(self) -> Trajectory:
         """Return the frames placed at once, as they were then."""
-        return _trajectory(self._live)
+        stamps, Ts, covariances = zip(*self._live, strict=True) if self._live else ((), (), ())
+        return _trajectory(stamps, np.array(Ts), np.array(covariances))
+
+    def _add(self, frame: Placed) -> None:
+        self._frames.append(frame)
+        self._version = -1
 
     def _measure_speeds_by(self, frame: Placed) -> None:
         """Let the units of a frame's keyframe be those that speeds so far are stretched with."""
@@ -196,21 +203,66 @@ class Path:
         """Return the fastest (2,) so far, a length and an angle per second, in units as of now."""
         if not self._frames:
             return self._fastest
-        now = self._map.scale(self._frames[-1].keyframe_id)
-        return self._fastest * (now / self._units, 1.0)
+        return self._fastest * (self._known_last()[1] / self._units, 1.0)
+
+    def _last_seconds(self) -> float:
+        """Return the time between the last two frames; 0 if they are apart, or in no order."""
+        if len(self._frames) < 2:
+            return 0.0
+        seconds = (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * 1e-9
+        return seconds if 0.0 < seconds <= 1.0 else 0.0
 
     def _pose(self, frame: Placed) -> Array:
         return self._map.place(frame.keyframe_id, frame.T_keyframe_body)
 
+    def _known_last(self) -> tuple[Array, float]:
+        """Return where (4, 4) the last frame is and the scale of its keyframe, as known now.
+
+        The same array as before where the map has not changed.
+        """
+        version = self._map.version
+        if self._frames and self._version != version:
+            self._T_last = self._pose(self.last)
+            self._scale_last = self._map.scale(self.last.keyframe_id)
+            self._version = version
+        return self._T_last, self._scale_last
+
+    def _known(self, frames: Sequence[Placed]) -> Trajectory:
+        """Return where frames are, as known now."""
+        if not frames:
+            return _trajectory((), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+        ids = [frame.keyframe_id for frame in frames]
+        Ts, relative = (
+            np.array([getattr(f, name) for f in frames])
+            for name in ("T_keyframe_body", "covariance")
+        )
+        with self._map.lock:
+            placements, sure = self._map.placements(ids), self._map.covariances(ids)
+        covariances = _in_world(sure, placements[1], Ts, relative)
+        Ts_world_body, _ = compose(placements, (Ts, np.ones(len(ids))))
+        return _trajectory([f.stamp_ns for f in frames], Ts_world_body, covariances)
+
+
+def _in_world(
+    of_keyframe: Array, scale: Array | float, T_keyframe_body: Array, relative: Array
+) -> Array:
+    """Return covariances (..., 6, 6) in the world of frames that hang from keyframes."""
+    T = T_keyframe_body.copy()
+    T[..., :3, 3] *= np.asarray(scale)[..., None]
+    Ad = se3_adjoint(se3_inverse(T))
+    return np.asarray(Ad @ of_keyframe @ np.swapaxes(Ad, -1, -2) + stretched(relative, scale))
+
 
 def _lengths(T_from: Array, T_to: Array) -> Array:
     """Return how far apart two poses are: a length, and an angle in radians."""
-    return np.asarray(np.linalg.norm(se3_log(se3_inverse(T_from) @ T_to).reshape(2, 3), axis=1))
+    R_t, twist = T_from[:3, :3].T, np.empty(6)
+    se3_log_into(R_t @ T_to[:3, :3], R_t @ (T_to[:3, 3] - T_from[:3, 3]), twist)
+    xi = twist.tolist()
+    return np.array([math.hypot(*xi[:3]), math.hypot(*xi[3:])])
 
 
-def _trajectory(rows: list[tuple[int, Array, Array]]) -> Trajectory:
-    stamps = np.array([stamp for stamp, _, _ in rows], np.int64)
-    Ts = np.array([T for _, T, _ in rows]).reshape(-1, 4, 4)
-    covariances = np.array([c for _, _, c in rows]).reshape(-1, 6, 6)
-    order = np.argsort(stamps, kind="stable")  # clocks of old logs jump back
-    return Trajectory(stamps[order], Ts[order], covariances[order])
+def _trajectory(stamps: Sequence[int], Ts: Array, covariances: Array) -> Trajectory:
+    stamps_ns = np.array(stamps, np.int64)
+    order = np.argsort(stamps_ns, kind="stable")  # clocks of old logs jump back
+    Ts, covariances = Ts.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6)
+    return Trajectory(stamps_ns[order], Ts[order], covariances[order])
