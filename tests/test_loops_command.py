@@ -15,11 +15,11 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.run import Interrupted, run
 from odomap.settings import override
-from odomap.sources.open import open as open_source
 from odomap.system.config import preset
 from odomap.system.stages import Loop, Stages
 from odomap.system.visualslam import VisualSlam
 from odomap.system.worker import InlineWorker
+from recordings import Rendered
 from stagedoubles import Solved
 
 WORLD = "sim:room?seed=3&frames=8&rate_hz=4&resolution=400x250"
@@ -53,19 +53,7 @@ class Deciding:
 
 @pytest.fixture(scope="module")
 def world():
-    source = open_source(WORLD)
-    frames = list(source)
-
-    class Rendered:
-        name, rig, truth, skipped = source.name, source.rig, source.truth, ()
-
-        def __len__(self):
-            return len(frames)
-
-        def __iter__(self):
-            return iter(frames)
-
-    return Rendered()
+    return Rendered(WORLD)
 
 
 @pytest.fixture

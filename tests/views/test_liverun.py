@@ -25,8 +25,9 @@ from odomap.system.stages import Loop
 from odomap.viewing import View
 from odomap.views.livescene import LiveScene
 from odomap.views.liveserver import close_server, open_server
+from recordings import Rendered
 
-WORLD = "sim:room?seed=3&frames=12"
+WORLD = "sim:room?seed=3&frames=12&resolution=400x250"
 FILES = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap", "config.yaml")
 
 
@@ -35,23 +36,9 @@ def viser():
     return pytest.importorskip("viser", reason="the live view needs viser")
 
 
-class Rendered:
-    """A simulated world whose frames are made once."""
-
-    def __init__(self, world):
-        self.name, self.rig, self.truth, self.skipped = world.name, world.rig, world.truth, []
-        self._frames = list(world)
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __iter__(self):
-        return iter(self._frames)
-
-
 @pytest.fixture(scope="module")
 def world():
-    return Rendered(open_source(WORLD))
+    return Rendered(WORLD)
 
 
 @pytest.fixture(scope="module")
