@@ -1,5 +1,7 @@
 """Keyframes in units of their own: what hangs from them is in the world where it was put."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,3 +114,47 @@ def test_a_correction_of_scale_stretches_a_covariance_and_what_hangs():
     np.testing.assert_allclose(moved, hangs, atol=1e-12)
     step = m.place(1, hangs)[:3, 3] - m.T_world_body(1)[:3, 3]
     np.testing.assert_allclose(np.linalg.norm(step), 3.0 * np.linalg.norm(hangs[:3, 3]))
+
+
+def hung(count=8):
+    """Return a map of keyframes along a line, each hanging from the one before."""
+    m = Map()
+    for k in range(count):
+        m.add_keyframe(Keyframe(k, 10 * k), se3_exp(np.array([k, 0, 0, 0, 0, 0.1 * k])))
+    return m
+
+
+def test_a_culled_keyframe_hangs_from_the_holder_it_is_given():
+    m, T = hung(), se3_exp(np.array([0.3, 0.1, 0, 0, 0, 0.2]))
+    frames = [m.place(k, T) for k in (4, 5)]
+    m.set_growth(6, np.eye(6))
+    m.cull_keyframes([4, 5], [1, 2])
+    assert [m.parent(k) for k in (4, 5, 6)] == [1, 2, 2]
+    for k, frame in zip((4, 5), frames):
+        np.testing.assert_allclose(m.place(k, T), frame, atol=1e-12)
+    assert np.isnan(m.growth(6)).all()  # from there nobody measured it
+    with pytest.raises(ValueError, match="came after"):
+        m.cull_keyframes([3], [6])
+    with pytest.raises(ValueError, match="holders"):
+        m.cull_keyframes([3, 6], [1])
+
+
+def test_edges_are_replaced_by_others():
+    m = hung()
+    for k in range(4):
+        m.add_edge(k, k + 1, np.eye(4), (k + 1) * np.eye(6), "submap")
+    before = m.edges()
+    two = replace(before, **{
+        name: getattr(before, name)[:2]
+        for name in ("i", "j", "Ts_i_j", "scales_i_j", "information")
+    }, kind=("folded",) * 2)  # fmt: skip
+    version = m.version
+    m.replace_edges([1, 2], two)
+    after = m.edges()
+    assert after.i.tolist() == [0, 3, 0, 1]
+    assert after.kind == ("submap", "submap", "folded", "folded")
+    assert after.information[:, 0, 0].tolist() == [1, 4, 1, 2]
+    assert m.version > version
+    assert m.add_edge(0, 7, np.eye(4), np.eye(6), "loop") == 4
+    with pytest.raises(ValueError, match="no edge 9"):
+        m.replace_edges([9], two)

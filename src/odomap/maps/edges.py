@@ -2,7 +2,8 @@
 
 An edge (i, j) says S_i_j = S_i⁻¹ S_j was measured as (T_i_j, scale_i_j) with an information matrix
 over the tangent (translation, rotation), right update. A measurement is never changed: an edge to a
-keyframe that was culled keeps its ids, and the stub says where that end is.
+keyframe that was culled keeps its ids, and the stub says where that end is. Where they would grow
+with time, some may be replaced by few that say the same of the keyframes which are left.
 
 Reference: R. Kümmerle et al., g2o: a general framework for graph optimization, 2011.
 """
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
 
-__all__ = ["GAP", "LOOP", "EdgeTable", "Edges"]
+__all__ = ["FOLDED", "GAP", "LOOP", "EdgeTable", "Edges"]
 
 LOOP = "loop"
 """Kind of the edges that say where two keyframes of one place lie to each other."""
 GAP = "gap"
 """Kind of the edges that say where nothing is known of that: a piece begins (`atlas`)."""
+FOLDED = "folded"
+"""Kind of the edges that say what others said, to keyframes that were culled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +81,19 @@ class Edges:
         self._kind.append(kind)
         return row
 
+    def replace(self, rows: NDArray[np.int64], others: EdgeTable) -> None:
+        """Remove edges, and append others; those that follow move up."""
+        stay = np.delete(np.arange(len(self)), rows)
+        self._ends = np.concatenate([self._ends[stay], np.column_stack([others.i, others.j])])
+        self._Ts = np.concatenate([self._Ts[stay], others.Ts_i_j])
+        self._scales = np.concatenate([self._scales[stay], others.scales_i_j])
+        self._information = np.concatenate([self._information[stay], others.information])
+        self._kind = [*(self._kind[row] for row in stay.tolist()), *others.kind]
+
     def ends_of_gaps(self) -> set[int]:
         """Return the keyframes on either side of gaps."""
+        if GAP not in self._kind:
+            return set()
         rows = [row for row, kind in enumerate(self._kind) if kind == GAP]
         return set(self._ends[rows].ravel().tolist())
 

@@ -164,7 +164,7 @@ class Map(Surroundings):
                 self.begin_piece(absorbed.root_id)
         return absorbed
 
-    def cull_keyframes(self, keyframe_ids: ArrayLike) -> None:
+    def cull_keyframes(self, keyframe_ids: ArrayLike, holder_ids: ArrayLike | None = None) -> None:
         """Remove keyframes that add nothing, and keep placed what hangs from them.
 
         Each leaves a stub below its parent; its landmarks are stored relative to the oldest
@@ -174,19 +174,24 @@ class Map(Surroundings):
 
         Args:
             keyframe_ids: (n,) keyframes; one at least must remain in the map.
+            holder_ids: (n,) living keyframes, older than these, that are to hold their stubs, such
+                as those nearest by; by default their parents.
         """
         with self.lock:
             ids = distinct_in_order(self._all_known(keyframe_ids))
             if len(ids) and np.isin(self._tree.alive(), ids).all():
                 raise ValueError("culling would leave no keyframe in the map")
-        for n, k in enumerate(ids.tolist()):
+            holders = np.full(len(ids), -1) if holder_ids is None else self._all_known(holder_ids)
+            if len(holders) != len(ids):
+                raise ValueError(f"{len(ids)} keyframes to be culled have {len(holders)} holders")
+        for n, (k, holder) in enumerate(zip(ids.tolist(), holders.tolist())):
             if n:
                 time.sleep(PAUSE_S)
             with self.lock:
                 if k in self._keyframes and k not in self._edges.ends_of_gaps():
-                    self._cull(k)
+                    self._cull(k, holder if holder < 0 else self._living(holder))
 
-    def _cull(self, k: int) -> None:
+    def _cull(self, k: int, holder: int = -1) -> None:
         if len(self._keyframes) == 1:
             raise ValueError("culling would leave no keyframe in the map")
         keyframe = np.array([k])
@@ -194,7 +199,7 @@ class Map(Surroundings):
         slots = self._landmarks.anchored(keyframe)
         placement = self._tree.placements(self.states, keyframe)
         points = act(placement, self._landmarks.p_anchor[slots])
-        holder = self._tree.cull(self.states, k)
+        holder = self._tree.cull(self.states, k, holder)
         heirs = self._observations.first_keyframe(slots)
         heirs[heirs < 0] = holder
         p_anchor = act_inverse(self.states.placements(heirs), points)

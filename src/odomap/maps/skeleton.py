@@ -230,6 +230,24 @@ class Skeleton:
             self.version += 1
             return self._edges.add(*ends, T_i_j, information, kind, scale_i_j)
 
+    def replace_edges(self, rows: ArrayLike, others: EdgeTable) -> None:
+        """Have other edges in place of some that were measured.
+
+        Args:
+            rows: (n,) of `edges`; those that follow move up.
+            others: appended.
+
+        Raises:
+            ValueError: there is no such row.
+        """
+        with self.lock:
+            gone = self._ids(rows)
+            if len(gone) and not 0 <= gone.min() <= gone.max() < len(self._edges):
+                raise ValueError(f"there is no edge {gone.max()}, only {len(self._edges)}")
+            self._all_known(np.concatenate([others.i, others.j]))
+            self._edges.replace(gone, others)
+            self.version += 1
+
     def begin_piece(self, keyframe_id: int) -> None:
         """Say that where a keyframe is relative to its parent is not known: an edge of kind "gap".
 

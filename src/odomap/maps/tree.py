@@ -131,23 +131,33 @@ class Tree:
         Ts[stub], scales[stub] = compose((Ts[stub], scales[stub]), relative)
         return Ts, scales
 
-    def cull(self, states: States, keyframe: int) -> int:
+    def cull(self, states: States, keyframe: int, holder: int = -1) -> int:
         """Turn a living keyframe into a stub and hand on what hung from it.
 
         Args:
             states: where the keyframes are.
             keyframe: a living keyframe, not the last one.
+            holder: a living keyframe that came before it, which is to hold the stub; by default
+                the parent or, for the root, its eldest child, which becomes the root.
 
         Returns:
-            The living keyframe that now holds the stub: the parent or, for the root, its eldest
-            child, which becomes the root.
+            The living keyframe that now holds the stub.
+
+        Raises:
+            ValueError: the holder came after it, and might hang from it.
         """
         children = np.flatnonzero((self.parent == keyframe) & (self.status == ALIVE))
         stubs = np.flatnonzero((self.parent == keyframe) & (self.status == STUB))
-        holder = int(self.parent[keyframe])
+        if holder >= 0 and self.created[holder] >= self.created[keyframe]:
+            raise ValueError(f"keyframe {holder} came after {keyframe}, which it is to hold")
+        is_parent = holder in (-1, int(self.parent[keyframe]))
+        holder = int(self.parent[keyframe]) if holder < 0 else holder
         if holder < 0:
             holder = int(children[np.argmin(self.created[children])])
-        hand_on(states, keyframe, holder, children)
+        if is_parent:
+            hand_on(states, keyframe, holder, children)
+        else:  # nobody told how sure it is from there
+            states.growths[np.r_[children, keyframe]] = np.nan
         self.parent[children] = np.where(children == holder, self.parent[keyframe], holder)
         moved = np.r_[keyframe, stubs]
         placed = self.placements(states, moved)

@@ -32,7 +32,12 @@ from odomap.system.localmapping import MappingConfig
 from odomap.system.loopsearch import ClosingConfig
 from odomap.system.mapping import WindowConfig
 from odomap.system.placeindex import PlacesConfig
-from odomap.system.scanconfig import ScanClosingConfig, ScanTrackingConfig, SubmapConfig
+from odomap.system.scanconfig import (
+    ScanClosingConfig,
+    ScanThinningConfig,
+    ScanTrackingConfig,
+    SubmapConfig,
+)
 from odomap.system.uncertainty import NoiseConfig
 from odomap.vision.bootstrap import BootstrapConfig
 from odomap.vision.depth import DepthConfig
@@ -110,6 +115,8 @@ class Config:
     """How large the grids are that scans are laid onto, and of what."""
     scan_closing: ScanClosingConfig = field(default_factory=ScanClosingConfig)
     """When scans are searched for in earlier submaps, and the path is corrected."""
+    scan_thinning: ScanThinningConfig = field(default_factory=ScanThinningConfig)
+    """When submaps go that show nothing new."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 

@@ -75,8 +75,13 @@ class LaserSlam(System):
         if not self._config.scan_closing.enabled:
             return None
         from odomap.system.scanclosing import ScanCloser  # what compiles pose graphs
+        from odomap.system.scanthinning import ScanThinner
 
-        return ScanCloser(self.map, self._beams, self.submaps, self._config.scan_closing)
+        parts, config = (self.map, self._beams, self.submaps), self._config
+        closer = ScanCloser(*parts, config.scan_closing)
+        if not config.scan_thinning.enabled:
+            return closer
+        return ScanThinner(closer, *parts, config.scan_thinning)
 
     @property
     def _path(self) -> Path:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
 
-__all__ = ["ScanClosingConfig", "ScanTrackingConfig", "SubmapConfig"]
+__all__ = ["ScanClosingConfig", "ScanThinningConfig", "ScanTrackingConfig", "SubmapConfig"]
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,27 @@ class ScanClosingConfig:
     """Factor on all standard deviations while it is decided which loops are true: submaps bend."""
     outlying: Positive = 10.0
     """Standard deviations at which a loop counts half."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
+class ScanThinningConfig:
+    """When submaps go that show nothing new."""
+
+    enabled: bool = True
+    """Whether any go: a map then grows with the space seen, and not with time."""
+    covers: Count = 4
+    """Older submaps that must show what a scan shows; each place is in two of each passage."""
+    near: Positive = 1.0
+    """How near one of their keyframes must be, metres."""
+    on_walls: Fraction = 0.75
+    """Share of the beams that must meet walls of such a submap."""
+    in_free: Fraction = 0.05
+    """Share of them that may end where it is free."""
+    share: Fraction = 0.9
+    """Share of a submap's scans that must be shown so for it to go."""
 
     def __post_init__(self) -> None:
         check_limits(self)

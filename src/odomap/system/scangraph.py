@@ -33,7 +33,7 @@ from odomap.geometry.planar import (
     to_plane,
 )
 from odomap.geometry.robust import Loss
-from odomap.maps.edges import LOOP
+from odomap.maps.edges import FOLDED, LOOP
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot
 from odomap.system.essentialgraph import EssentialGraph
@@ -150,7 +150,7 @@ def read_graph(map: Map, false: Set[Pair]) -> ScanGraph:
         edges = map.edges()
     kinds = np.array(edges.kind, str)
     alive = np.isin(edges.i, snapshot.keyframe_ids) & np.isin(edges.j, snapshot.keyframe_ids)
-    used = np.flatnonzero(alive & np.isin(kinds, (SUBMAP, LOOP)))
+    used = np.flatnonzero(alive & np.isin(kinds, (SUBMAP, FOLDED, LOOP)))
     ends = zip(edges.j[used].tolist(), edges.i[used].tolist(), strict=True)
     return ScanGraph(
         snapshot,

@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-NEW, IN_TURN = 4, 2
+NEW, IN_TURN = 3, 1
 """Submaps that are looked at: so many of the newest, and of the others."""
 EVERY = 3
 """Of the keyframes of a submap, and of the beams of a scan, those that are looked at."""
@@ -216,51 +216,58 @@ def redundant(read: _Read, beams: Beams, config: ScanThinningConfig) -> list[Sub
         beams: of the laser.
         config: when.
     """
-    gone: set[int] = set()
-    walls: dict[int, Bool] = {}
+    gone: list[int] = []
+    look = _Look(read, beams, config)
     for n in read.looked_at.tolist():
-        older = [read.finished[m] for m in range(n) if m not in gone]
-        shown = [
-            _is_shown(read, k, older, beams, config, walls)
-            for k in read.finished[n].keyframe_ids[::EVERY]
-            if k in read.keyframes
-        ]
-        if len(older) >= config.covers and np.mean(shown or [1.0]) >= config.share:
-            gone.add(n)
-    return [read.finished[n] for n in sorted(gone)]
+        ids = [k for k in read.finished[n].keyframe_ids[::EVERY] if k in read.keyframes]
+        may_fail = round((1.0 - config.share) * len(ids))
+        failed = 0
+        for k in ids:
+            failed += not look.is_shown(k, n, gone)
+            if failed > may_fail:
+                break
+        if failed <= may_fail:
+            gone.append(n)
+    return [read.finished[n] for n in gone]
 
 
-def _is_shown(
-    read: _Read,
-    k: int,
-    submaps: list[Submap],
-    beams: Beams,
-    config: ScanThinningConfig,
-    walls: dict[int, Bool],
-) -> bool:
-    """Say whether enough submaps show what a keyframe saw."""
-    x, scan = read.place(k), read.keyframes[k].scan
-    hits = np.zeros((0, 2)) if scan is None else beams.points(scan).hits[::EVERY]
-    hits = hits[np.linalg.norm(hits, axis=1) < FARTHEST]
-    shown = 0
-    for submap in submaps:
-        x_anchor = read.place(submap.anchor_id)
-        in_submap = between_planar(x_anchor, x)
-        if np.linalg.norm(in_submap[:2] - submap.middle) > submap.radius:
-            continue
-        places = read.x[read.rows(submap.keyframe_ids), :2]
-        if np.linalg.norm(places - x[:2], axis=1).min(initial=np.inf) > config.near:
-            continue
-        if submap.anchor_id not in walls:
-            walls[submap.anchor_id] = beside(is_wall(submap.grid))
+class _Look:
+    """Looks whether submaps show what keyframes saw."""
+
+    def __init__(self, read: _Read, beams: Beams, config: ScanThinningConfig) -> None:
+        self._read, self._beams, self._config = read, beams, config
+        rows = [read.rows(submap.keyframe_ids) for submap in read.finished]
+        self._owner = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+        self._places = read.x[np.concatenate(rows), :2]
+        self._walls: dict[int, Bool] = {}
+
+    def is_shown(self, k: int, before: int, gone: list[int]) -> bool:
+        """Say whether enough submaps before one, but for those that go, show a keyframe's scan."""
+        config, x, scan = self._config, self._read.place(k), self._read.keyframes[k].scan
+        apart = self._places - x[:2]
+        owners = np.unique(self._owner[np.hypot(*apart.T) <= config.near])
+        owners = np.setdiff1d(owners[owners < before], gone)
+        if len(owners) < config.covers or scan is None:
+            return False
+        hits = self._beams.points(scan).hits[::EVERY]
+        hits = hits[np.hypot(*hits.T) < FARTHEST]
+        shown = 0
+        for left, n in zip(range(len(owners), 0, -1), owners.tolist()):
+            shown += self._shows(n, x, hits)
+            if shown >= config.covers or shown + left <= config.covers:
+                break
+        return shown >= config.covers
+
+    def _shows(self, n: int, x: Array, hits: Array) -> bool:
+        """Say whether a submap shows beams (N, 2) that were seen from a place (3,)."""
+        submap = self._read.finished[n]
+        if n not in self._walls:
+            self._walls[n] = beside(is_wall(submap.grid))
+        in_submap = between_planar(self._read.place(submap.anchor_id), x)
         points = transform_planar(in_submap, hits)
-        on_walls = _share(submap.grid, walls[submap.anchor_id], points)
-        shown += on_walls >= config.on_walls and (
-            submap.grid.share_in_free(points) <= config.in_free
-        )
-        if shown >= config.covers:
-            return True
-    return False
+        if _share(submap.grid, self._walls[n], points) < self._config.on_walls:
+            return False
+        return submap.grid.share_in_free(points) <= self._config.in_free
 
 
 def _share(grid: OccupancyGrid, marked: Bool, points: Array) -> float:
@@ -373,6 +380,11 @@ def _with_kind(edges: EdgeTable, rows: Index, kind: str) -> EdgeTable:
 
 def _joined(a: EdgeTable, b: EdgeTable) -> EdgeTable:
     """Return the edges of both."""
-    columns = ("i", "j", "Ts_i_j", "scales_i_j", "information")
-    arrays = (np.concatenate([getattr(a, name), getattr(b, name)]) for name in columns)
-    return EdgeTable(*arrays, (*a.kind, *b.kind))
+    return EdgeTable(
+        np.concatenate([a.i, b.i]),
+        np.concatenate([a.j, b.j]),
+        np.concatenate([a.Ts_i_j, b.Ts_i_j]),
+        np.concatenate([a.scales_i_j, b.scales_i_j]),
+        np.concatenate([a.information, b.information]),
+        (*a.kind, *b.kind),
+    )

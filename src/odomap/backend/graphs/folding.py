@@ -72,7 +72,9 @@ def fold(graph: PoseGraph, is_gone: Bool) -> Folded:
         (np.float64(2.0), np.float64(2.0))
     """
     graph = graph.placed(solve(graph, initial="given").Ts_world_node) if graph.num_edges else graph
-    first, second, information = [], [], [np.zeros((0, graph.dim, graph.dim))]
+    first: list[Index] = []
+    second: list[Index] = []
+    information: list[Array] = [np.zeros((0, graph.dim, graph.dim))]
     label = find_components(graph).label
     for part in range(label.max(initial=-1) + 1):
         nodes = np.flatnonzero(label == part)
@@ -83,9 +85,9 @@ def fold(graph: PoseGraph, is_gone: Bool) -> Folded:
         pairs = _cheapest_tree(np.linalg.slogdet(covariances)[1])
         first.append(stay[pairs[:, 0]])
         second.append(stay[pairs[:, 1]])
-        information.append(np.linalg.inv(covariances[pairs[:, 0], pairs[:, 1]]))
-    none = [np.zeros(0, np.int64)]
-    i, j = np.concatenate(none + first), np.concatenate(none + second)
+        information.append(np.asarray(np.linalg.inv(covariances[tuple(pairs.T)])))
+    none = np.zeros(0, np.int64)
+    i, j = np.concatenate([none, *first]), np.concatenate([none, *second])
     Ts = graph.Ts_world_node
     matrices = np.concatenate(information)
     symmetric = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
@@ -102,7 +104,10 @@ def _relative_covariances(graph: PoseGraph, nodes: Index, count: int) -> Array:
     row[nodes] = np.arange(len(nodes))
     used = row[graph.first] >= 0
     i, j, information = row[graph.first[used]], row[graph.second[used]], graph.information[used]
-    M = lie.adjoint(lie.inverse(Ts[nodes[j]]) @ Ts[nodes[i]])
+    between = lie.inverse(Ts[nodes[i]]) @ Ts[nodes[j]]
+    J = lie.right_jacobian_inverse(lie.log(lie.inverse(graph.Ts_first_second[used]) @ between))
+    information = np.swapaxes(J, 1, 2) @ information @ J
+    M = lie.adjoint(lie.inverse(between))
     H = np.zeros((len(nodes), len(nodes), k, k))
     across = -np.swapaxes(M, 1, 2) @ information
     np.add.at(H, (i, i), -across @ M)
