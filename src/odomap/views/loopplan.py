@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from odomap.views.loopview import LoopView
@@ -202,7 +203,7 @@ def _legend(figure: Figure, ax: Axes) -> None:
     handles, labels = ax.get_legend_handles_labels()
     order = ("path", "path as it was before", "truth", *ENDS)
     chosen = [handles[labels.index(name)] for name in order if name in labels]
-    figure.legend(
+    legend = figure.legend(
         handles=chosen,
         loc="upper left",
         bbox_to_anchor=(0.055, 1.0),
@@ -212,3 +213,8 @@ def _legend(figure: Figure, ax: Axes) -> None:
         frameon=False,
         handlelength=1.4,
     )
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_linestyle() == "None":
+            handle.set(
+                alpha=1.0, markersize=4.5, markeredgewidth=1.4
+            )  # however fine they are drawn
