@@ -33,6 +33,7 @@ __all__ = ["Beams", "ScanPoints"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Count = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,40 +96,80 @@ class Beams:
         """
         if ranges.shape != (len(self),):
             raise ValueError(f"a scan of {len(ranges)} beams, expected {len(self)}")
-        is_hit = (ranges >= self._near) & (ranges <= self._far)
-        p = self._origin + self._directions * np.where(is_hit, ranges, 0.0)[:, None]
-        nothing = np.isposinf(ranges) | (ranges > self._far)
-        reach = min(self.config.free, self._far)
-        ends = self._origin + reach * self._directions[nothing] if reach else np.zeros((0, 2))
-        is_one = self._is_one_surface(p, ranges, is_hit)
-        normals = np.zeros_like(p)
-        find_normals(p, is_hit, is_one, self.config.baseline, np.cos(self.config.bend), normals)
+        ranges, config = np.array(ranges, np.float64), self.config  # kernels want it writable
+        p, normals = np.empty((len(self), 2)), np.zeros((len(self), 2))
+        is_hit, is_one = np.empty(len(self), bool), np.empty(max(len(self) - 1, 0), bool)
+        parts = np.empty(len(is_one), np.int64)
+        beams = self._directions, self._origin, self._step
+        surfaces = config.gap, config.ratio, config.spacing
+        count = lay_beams(
+            ranges, *beams, self._near, self._far, *surfaces, p, is_hit, is_one, parts
+        )
+        between = np.empty((count, 2))
+        fill_between(p, parts, between)
+        find_normals(p, is_hit, is_one, config.baseline, np.cos(config.bend), normals)
         return ScanPoints(
             origin=self._origin,
             hits=p[is_hit],
             normals=normals[is_hit],
-            between=_between(p, is_one, self.config.spacing),
-            free=ends,
+            between=between,
+            free=self._free(ranges),
             num_beams=len(ranges),
-            num_invalid=int(np.isnan(ranges).sum()),
+            num_invalid=int(np.count_nonzero(np.isnan(ranges))),
         )
 
-    def _is_one_surface(self, p: Array, ranges: Array, is_hit: Mask) -> Mask:
-        """Say of each beam but the last whether it and the next may be of one surface."""
-        config = self.config
-        step = np.linalg.norm(p[1:] - p[:-1], axis=1)
-        nearer = np.where(is_hit[1:] & is_hit[:-1], np.minimum(ranges[1:], ranges[:-1]), 0.0)
-        return np.asarray((step < config.gap) & (step < config.ratio * nearer * self._step))
+    def _free(self, ranges: Array) -> Array:
+        """Return how far the way is free (F, 2) where nothing came back."""
+        reach = min(self.config.free, self._far)
+        if not reach:
+            return np.zeros((0, 2))
+        nothing = np.isposinf(ranges) | (ranges > self._far)
+        return np.asarray(self._origin + reach * self._directions[nothing])
 
 
-def _between(p: Array, is_one: Mask, spacing: float) -> Array:
-    """Return points on the surfaces between neighbours, (M, 2)."""
-    step = np.linalg.norm(p[1:] - p[:-1], axis=1)
-    parts = np.where(is_one, np.ceil(step / spacing), 1.0).astype(np.int64) - 1
-    i = np.repeat(np.arange(len(parts)), parts)
-    n = np.arange(len(i)) - np.repeat(np.cumsum(parts) - parts, parts) + 1.0
-    share = (n / (parts[i] + 1.0))[:, None]
-    return np.asarray((1.0 - share) * p[i] + share * p[i + 1])
+@kernel
+def lay_beams(
+    ranges: Array,
+    directions: Array,
+    origin: Array,
+    angle: float,
+    near: float,
+    far: float,
+    gap: float,
+    ratio: float,
+    spacing: float,
+    p: Array,
+    is_hit: Mask,
+    is_one: Mask,
+    parts: Count,
+) -> int:
+    """p ← o + r d where a beam came back; is_one: whether it and the next may be of one surface,
+    and parts: into how many that is cut. Returns how many points lie between all."""
+    count = 0
+    for i in range(len(ranges)):
+        is_hit[i] = near <= ranges[i] <= far
+        r = ranges[i] if is_hit[i] else 0.0
+        p[i, 0], p[i, 1] = origin[0] + directions[i, 0] * r, origin[1] + directions[i, 1] * r
+    for i in range(len(ranges) - 1):
+        x, y = p[i + 1, 0] - p[i, 0], p[i + 1, 1] - p[i, 1]
+        step = np.sqrt(x * x + y * y)
+        nearer = min(ranges[i], ranges[i + 1]) if is_hit[i] and is_hit[i + 1] else 0.0
+        is_one[i] = step < gap and step < ratio * nearer * angle
+        parts[i] = int(np.ceil(step / spacing)) if is_one[i] else 1
+        count += max(parts[i] - 1, 0)
+    return count
+
+
+@kernel
+def fill_between(p: Array, parts: Count, between: Array) -> None:
+    """between ← the points that cut the ways to the next."""
+    m = 0
+    for i in range(len(parts)):
+        for n in range(1, parts[i]):
+            share = n / parts[i]
+            for k in range(2):
+                between[m, k] = (1.0 - share) * p[i, k] + share * p[i + 1, k]
+            m += 1
 
 
 @kernel
