@@ -34,6 +34,7 @@ from odomap.system.slam import Slam
 from odomap.system.system import System
 
 WITHOUT_LOOPS = (("scan_closing.enabled", "false"),)
+WITHOUT_THINNING = (("scan_thinning.enabled", "false"),)
 EVERY = 5
 """Of the frames of a world, those whose beams say which walls can be seen."""
 
@@ -129,7 +130,7 @@ class Held:
         memory_mb: of the process, over what it held before the first frame.
         peak_mb: the most it ever held, all in all.
         lost: frames of this round.
-        percent: ATE so far, relative to the path.
+        ate_m: of the path so far.
         nees: as of a building.
         ms: of a frame in this round, mean.
     """
@@ -141,7 +142,7 @@ class Held:
     memory_mb: float
     peak_mb: float
     lost: int
-    percent: float
+    ate_m: float
     nees: float
     ms: float
 
@@ -258,16 +259,17 @@ def factor_of_real_time(file: Path) -> float:
     return float(metrics["duration_s"]) / seconds
 
 
-def rounds_of(name: str, rounds: int) -> list[Held]:
+def rounds_of(name: str, rounds: int, thins: bool = True) -> list[Held]:
     """Go round a world in a process of its own; return what is held after each round."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        return pool.submit(_gone_round, f"{name}&rounds={rounds}", rounds).result()
+        return pool.submit(_gone_round, f"{name}&rounds={rounds}", rounds, thins).result()
 
 
-def _gone_round(name: str, rounds: int) -> list[Held]:
+def _gone_round(name: str, rounds: int, thins: bool) -> list[Held]:
     source = open_source(name)
-    system = Slam(source.rig)
+    config = chosen_config("lidar2d", overrides=() if thins else WITHOUT_THINNING)
+    system = Slam(source.rig, config)
     for module in needed_modules():
         warm_up(module)
     held: list[Held] = []
@@ -299,7 +301,7 @@ def _held(system: System, source: SimulatedSource, before: float, lost: int, ms:
         memory,
         peak_memory_mb(),
         lost,
-        ate(path.trajectory, source.truth).percent,
+        ate(path.trajectory, source.truth).rmse,
         planar_nees(path.trajectory, source.truth),
         ms,
     )

@@ -59,7 +59,8 @@ def _panels(estimates: Sequence[Estimate], growth: Growth) -> list[_Panel]:
         panels.append(
             _Panel("Keyframes", t, growth.keyframes.astype(np.float64), made.astype(np.float64))
         )
-        panels.append(_Panel("Landmarks", t, growth.landmarks.astype(np.float64)))
+        if growth.landmarks.any():  # lasers have none
+            panels.append(_Panel("Landmarks", t, growth.landmarks.astype(np.float64)))
     inside = growth.memory_frames < len(t)
     if inside.any() and (growth.memory_mb[inside] > 0).all():
         memory = growth.memory_mb[inside]

@@ -108,6 +108,7 @@ def _path(report: Report) -> str:
     )
     coloured = place.distances is not None
     ties = np.zeros((0, 2, 3)) if loops is None else loops
+    has_points = report.points is not None and len(report.points) > 0
     return f"""<figure>{flat_view}<figcaption>{caption}</figcaption></figure>
 <h3>In three dimensions</h3>
 <div class="view">
@@ -118,7 +119,7 @@ browser with canvas.</canvas>
 <input id="path3d-time" type="range" min="0" max="0" value="0" aria-label="Position along the path">
 <output id="path3d-clock"></output></div>
 </div>
-{_legend3d(coloured, place.truth is not None, report.points is not None, bool(len(ties)))}
+{_legend3d(coloured, place.truth is not None, has_points, bool(len(ties)))}
 <p class="note">Drag to turn, shift-drag to move, wheel to zoom, double-click to reset.</p>
 <noscript><p class="note">The interactive view needs JavaScript; nothing is loaded.</p></noscript>
 <script type="application/json" id="path3d-data">\

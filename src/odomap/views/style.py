@@ -15,6 +15,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 __all__ = [
     "ERROR_COLOURS",
@@ -118,7 +119,10 @@ def legend(ax: Axes, **options: object) -> None:
         "columnspacing": 1.2,
         "borderaxespad": 0.2,
     }
-    ax.legend(**{**settings, **options})
+    drawn = ax.legend(**{**settings, **options})
+    for handle in drawn.legend_handles:
+        if isinstance(handle, Line2D):
+            handle.set(alpha=1.0, linewidth=max(handle.get_linewidth(), 1.0))
 
 
 def figure_png(figure: Figure, dpi: float = PNG_DPI) -> bytes:
