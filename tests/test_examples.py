@@ -131,6 +131,27 @@ def test_solution_of_exercise_2(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_solution_of_exercise_3(tmp_path):
+    picture = tmp_path / "odometry.png"
+    recording = "sim:hall?sensors=laser&seed=4&rate_hz=4&beams=271&frames=70"
+    errors = main_of("exercise_3_solution.py")(recording, str(picture))
+    for step in ("points", "lines"):
+        assert 2.0 * errors[f"map, {step}"] < errors[f"last scan, {step}"]
+        assert 2.0 * errors["map, lines"] < errors["map, points"] < 0.05
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_solution_of_exercise_4(tmp_path):
+    recording = "sim:hall?sensors=laser&seed=4&rate_hz=1&beams=241&range_m=8&moving_objects=3"
+    found = main_of("exercise_4_solution.py")(
+        recording, str(tmp_path / "grid.yaml"), str(tmp_path / "grid.png")
+    )
+    assert found["same"] == 1.0
+    assert min(found["true"], found["found"]) > 0.95
+    assert found["free_false"] < 0.005
+    assert (tmp_path / "grid.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_solution_of_exercise_5(tmp_path):
     picture = tmp_path / "loop.png"
     recording = "sim:room?seed=4&frames=52&sensors=mono,depth&speed=6"

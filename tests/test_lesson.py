@@ -23,6 +23,7 @@ LESSON = ROOT / "docs" / "lesson"
 ORB_SLAM = LESSON / "03_orb_slam.md"
 PLACES = LESSON / "03b_bag_of_words.md"
 LOOPS = LESSON / "03c_closing_loops.md"
+LASERS = LESSON / "04_lidar_slam.md"
 BACK_END = LESSON / "05_loop_closure_and_optimisation.md"
 PAGES = sorted(LESSON.glob("*.md"))
 CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
@@ -62,6 +63,7 @@ def test_there_are_chapters():
         "03_orb_slam.md",
         "03b_bag_of_words.md",
         "03c_closing_loops.md",
+        "04_lidar_slam.md",
         "05_loop_closure_and_optimisation.md",
     ]
 
@@ -144,6 +146,7 @@ def test_an_example_prints_what_is_shown(name):
         (ORB_SLAM, range(18, 24)),
         (PLACES, range(24, 25)),
         (LOOPS, range(25, 30)),
+        (LASERS, range(30, 39)),
     ],
 )
 def test_all_examples_of_a_chapter_are_shown(page, numbers):
@@ -258,6 +261,65 @@ def test_two_maps_become_one():
     assert results["places"] >= 10
     assert results["off"] < 20.0
     assert results["merged"] < 1.5 * max(results["first"], results["second"])
+
+
+def test_lines_are_worth_more_than_many_steps():
+    off = ran("30_icp_step_by_step.py")[0]
+    assert off["onto_lines"][5] < 10.0 < 50.0 < off["onto_points"][40]
+
+
+def test_motions_are_put_together_in_one_way():
+    off = list(ran("31_compose_motions.py")[0].values())
+    assert off[0] < 1e-6
+    assert min(off[1:]) > 10.0
+
+
+def test_a_map_drifts_less_than_the_last_scan():
+    ate = ran("32_scan_to_map.py")[0]
+    assert 5.0 * ate["map"] < ate["keyframe"] < ate["last scan"]
+
+
+def test_a_corridor_is_left_to_the_wheels():
+    off = ran("33_corridor.py")[0]
+    believed, blind = "both, scans as sure as they say", "both, scans sure to 1 cm everywhere"
+    assert off[f"hall, {believed}"] < off["hall, wheels alone"]
+    assert off[f"corridor, {believed}"] < 2.0 * off["corridor, wheels alone"]
+    assert off[f"corridor, {blind}"] > 10.0 * off[f"corridor, {believed}"]
+
+
+def test_probabilities_are_not_added():
+    wrong = ran("34_log_odds.py")[0]
+    assert wrong["tenths"][2] > 0.4
+    assert wrong["log-odds"][2] == 0.0
+    assert wrong["log-odds"][:3] == wrong["Bayes"][:3]
+    assert wrong["with limit"][3] < 20 < wrong["log-odds"][3] < wrong["Bayes"][3]
+
+
+def test_rays_take_people_away():
+    cases = ran("35_rays.py")[0]
+    ghosts = [cases[name][1] for name in ("hits alone", "hits and rays", "nothing back: free")]
+    assert ghosts[0] > 3 * ghosts[1] > 0
+    assert ghosts[2] == 0
+    assert [case[3] > 5.0 for case in cases.values()] == [False, False, False, True]
+
+
+def test_loops_make_walls_single():
+    results = ran("36_laser_slam.py")[0]
+    (ate_without, walls_without), (ate_with, walls_with) = results.values()
+    assert ate_with < 0.8 * ate_without
+    assert walls_with > walls_without + 0.2
+
+
+def test_bounds_spare_nearly_all_poses():
+    score, share, off = ran("37_branch_and_bound.py")[0]
+    assert score > 0.9
+    assert share < 1e-3
+    assert off < 0.1
+
+
+def test_a_robot_finds_itself_in_a_saved_grid():
+    for off in ran("38_localise_in_a_grid.py")[0].values():
+        assert max(off) < 40.0
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
