@@ -76,7 +76,7 @@ class Drawn:
         loops: closed.
         refused: candidates that were not.
         lost: frames.
-        doubled: share of wall cells with a parallel wall close by.
+        doubled: share of the cells of long walls with a parallel one close by.
         open: share of beams that end where the grid is free.
         moved_m: most that closing loops moved a keyframe by, in one go.
         doubled_without: without loops.
