@@ -110,8 +110,8 @@ class Beams:
         find_normals(p, is_hit, is_one, config.baseline, np.cos(config.bend), normals)
         return ScanPoints(
             origin=self._origin,
-            hits=p[is_hit],
-            normals=normals[is_hit],
+            hits=p.compress(is_hit, 0),
+            normals=normals.compress(is_hit, 0),
             between=between,
             free=self._free(ranges),
             num_beams=len(ranges),
