@@ -62,25 +62,36 @@ def robot(ax: Axes, x: Array, colour: str, size: float = 0.35, **how: object) ->
     ax.add_patch(Polygon(corners, closed=True, fc=colour, ec="none", zorder=4, **how))
 
 
-def icp_steps() -> Figure:
-    """Two scans before each of some steps of ICP, with the pairs."""
+def steps_of_icp(way: str, shown: tuple[int, ...]) -> Figure:
+    """Draw two scans before the first step of ICP and after some, with the pairs."""
     names = example("30_icp_step_by_step")
     source, target, T_true = names["two_scans"]()
-    steps = list(names["icp"](source, target, names["onto_points"]))
+    steps = list(names["icp"](source, target, names[way]))
     figure = new_figure(9.6, 5.9)
     figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=0.95)
     axes = figure.subplots(2, 3, gridspec_kw={"wspace": 0.03, "hspace": 0.12})
-    for ax, k in zip(axes.flat, (0, 2, 5, 10, 20, 40)):
+    for ax, k in zip(axes.flat, shown):
         T, p, q = steps[k]
         x, y, turn = se2_log(se2_inverse(T_true) @ T)
         off = f"{1000 * np.hypot(x, y):.0f} mm, {np.degrees(abs(turn)):.1f}°"
-        dress(ax, f"{'as they came' if not k else f'after {k} steps'}: {off} off")
+        after = f"after {k} step" + "s" * (k != 1)
+        dress(ax, f"{after if k else 'as they came'}: {off} off")
         ax.plot(*target.hits.T, "o", color=GREY, ms=3.2, mew=0)
         ax.add_collection(LineCollection(np.stack([p, q], axis=1), color=ORANGE, lw=1.2))
         ax.plot(*(source.hits @ T[:2, :2].T + T[:2, 2]).T, ".", color=BLUE, ms=2.6)
         ax.set_aspect("equal")
         ax.tick_params(labelbottom=False, labelleft=False, length=0)
     return figure
+
+
+def icp_steps() -> Figure:
+    """Points onto points."""
+    return steps_of_icp("onto_points", (0, 2, 5, 10, 20, 40))
+
+
+def icp_line_steps() -> Figure:
+    """Points onto lines, every step."""
+    return steps_of_icp("onto_lines", (0, 1, 2, 3, 4, 5))
 
 
 def icp_convergence() -> Figure:
@@ -346,8 +357,8 @@ def exercise_4() -> Figure:
 
 
 FIGURES: tuple[Callable[[], Figure], ...] = (
-    laser_scan, icp_steps, icp_convergence, compose, scan_to_map, corridor, log_odds, rays,
-    grid_loops, branch_and_bound, exercise_3, exercise_4,
+    laser_scan, icp_steps, icp_line_steps, icp_convergence, compose, scan_to_map, corridor,
+    log_odds, rays, grid_loops, branch_and_bound, exercise_3, exercise_4,
 )  # fmt: skip
 
 
