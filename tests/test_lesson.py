@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from odomap.sensors.frame import Frame
+from odomap.simulation.world import World
 from printed import assert_same_output
 
 ROOT = Path(__file__).parent.parent
@@ -28,6 +30,23 @@ BACK_END = LESSON / "05_loop_closure_and_optimisation.md"
 PAGES = sorted(LESSON.glob("*.md"))
 CHAPTERS = sorted(LESSON.glob("[0-9]*.md"))
 EXAMPLE = re.compile(r"\(\.\./\.\./(examples/\w+\.py)\)")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _pictures_are_rendered_once():
+    """Chapters, exercises and programs look at the same worlds."""
+    render, made = World.frame, {}
+
+    def frame(self: World, index: int) -> Frame:
+        key = self.spec, index
+        if key not in made:
+            made[key] = render(self, index)
+        # With depth frames are large, and few of those worlds are looked at twice.
+        return made[key] if made[key].depth is None else made.pop(key)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(World, "frame", frame)
+        yield
 
 
 def python_blocks(page: Path) -> list[tuple[str | None, str, str | None]]:

@@ -48,7 +48,8 @@ def close_loops(with_scale):
 for name in sys.argv[2:]:
     sensors = "mono,depth" if name == "rgbd" else "stereo"
     frames = 24 if name in ("mono", "stereo-flow") else 14
-    source, config = odomap.open(f"sim:room?seed=3&frames={frames}&sensors={sensors}"), preset(name)
+    world = f"sim:room?seed=3&frames={frames}&sensors={sensors}&resolution=400x250"
+    source, config = odomap.open(world), preset(name)
     config = replace(config, closing=replace(config.closing, enabled=sys.argv[1] == "closing"))
     slam = odomap.Slam(source.rig, config)
     for module in needed_modules():
