@@ -79,8 +79,9 @@ def between_planar(a: Array, b: Array) -> Array:
 
 def transform_planar(x: Array, points: Array) -> Array:
     """Return points (N, 2) given in a pose (3,) as seen from where that is given."""
-    c, s = np.cos(x[2]), np.sin(x[2])
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + x[:2])
+    t_x, t_y, angle = x.tolist()
+    c, s = math.cos(angle), math.sin(angle)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]) + (t_x, t_y))
 
 
 def moved_covariance(covariance: Array, motion: Array) -> Array:

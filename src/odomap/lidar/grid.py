@@ -143,21 +143,23 @@ class OccupancyGrid:
         """
         nothing = np.zeros((0, 2))
         between, free = (nothing if x is None else x for x in (between, free))
-        starts = np.empty((len(hits) + len(free), 2))
+        ends = np.concatenate([hits, between, free])
+        starts = np.empty((len(hits) + len(free) + 1, 2))
         starts[:] = sensor
         if free_from is not None:
-            starts[len(hits) :] = free_from
-        self._hold(np.concatenate([hits, between, free, starts, np.reshape(sensor, (1, 2))]))
+            starts[len(hits) : -1] = free_from
+        self._hold(ends, starts)
         self._count += 1
         cells, evidence = 1.0 / self.resolution, self.evidence
-        ends = (np.concatenate([hits, between, free]) - self.origin) * cells
-        starts = (starts - self.origin) * cells
-        occupied = len(hits) + len(between)
+        ends, starts = (ends - self.origin) * cells, (starts[:-1] - self.origin) * cells
+        occupied = ends[: len(hits) + len(between)]
         parts = self.log_odds, self._marks, self._count
-        hit_cells(*parts, ends[:occupied], evidence.hit, evidence.limit)
+        hit_cells(*parts, occupied, evidence.hit, evidence.limit)
         if self.hits is not None:
-            sum_hits(self.hits, ends[:occupied])
-        rays = np.concatenate([ends[: len(hits)], ends[occupied:]])
+            sum_hits(self.hits, occupied)
+        rays = ends[: len(hits)]
+        if len(free):
+            rays = np.concatenate([rays, ends[len(occupied) :]])
         pass_cells(*parts, starts, rays, evidence.miss, evidence.limit)
 
     def probability(self, points: Array) -> Array:
@@ -206,15 +208,17 @@ class OccupancyGrid:
             finished.hits = np.round(255.0 * mean).astype(np.uint8)
         return finished
 
-    def _hold(self, points: Array) -> None:
+    def _hold(self, *points: Array) -> None:
         """Grow until points (N, 2) lie inside."""
-        box = np.empty((2, 2))
-        if not find_box(points, box):
+        box = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
+        if not all([widen_box(each, box) for each in points]):
             raise ValueError("a point of a scan is not finite")
-        low, high = np.floor((box - self.origin) / self.resolution).astype(np.int64)
-        shape = np.array(self.log_odds.shape[::-1])
-        if (low >= 0).all() and (high < shape).all():
+        cells = (box - self.origin) / self.resolution
+        (left, down), (right, up) = cells.tolist()
+        height, width = self.log_odds.shape
+        if left >= 0 and down >= 0 and right < width and up < height:
             return
+        (low, high), shape = np.floor(cells).astype(np.int64), np.array([width, height])
         if not shape.all():
             before, size = -low + MARGIN, high - low + 1 + 2 * MARGIN
         else:
@@ -256,10 +260,8 @@ def _moved(cells: NDArray[C], before: NDArray[np.int64], size: NDArray[np.int64]
 
 
 @kernel
-def find_box(points: Array, box: Array) -> bool:
-    """box ← the least and the greatest x and y; False if one of them is not finite."""
-    for k in range(2):
-        box[0, k], box[1, k] = np.inf, -np.inf
+def widen_box(points: Array, box: Array) -> bool:
+    """box ← the least and the greatest x and y of it and points; False if one is not finite."""
     for i in range(len(points)):
         for k in range(2):
             if not np.isfinite(points[i, k]):

@@ -211,13 +211,14 @@ class ScanTracker:
         x_keyframe_body = between_planar(submap.x_anchor_keyframe, submap.x_anchor_body)
         covariance = lift_covariance(self._since)
         placed = Placed(frame.stamp_ns, self._keyframe, from_plane(x_keyframe_body), covariance)
-        before = self.path.last
+        before, T_before = self.path.last, self.path.last_pose()
         correction = self.path.correction()
         T_world_body, in_world = self.path.append(placed)
-        self._note_step(before, placed)
+        self._step = between_planar(to_plane(T_before), to_plane(T_world_body))
+        self._step_s = (placed.stamp_ns - before.stamp_ns) * 1e-9
         status = Status.RECOVERED if self._is_lost or correction else Status.TRACKING
         reason, self._is_lost = reason or correction, False
-        moved = np.linalg.norm(x_keyframe_body[:2]) > self._config.keyframe_m
+        moved = np.hypot(*x_keyframe_body[:2]) > self._config.keyframe_m
         turned = abs(x_keyframe_body[2]) > self._config.keyframe_rad
         is_keyframe = bool(self._is_mapping and match is not None and (moved or turned))
         self._wanted = view if is_keyframe else None
@@ -278,12 +279,6 @@ class ScanTracker:
         if frame.odometry is None or not self._config.use_odometry:
             return None
         return to_plane(frame.odometry)
-
-    def _note_step(self, before: Placed, now: Placed) -> None:
-        """Keep how the body moved, for a prediction without odometry."""
-        a, b = (to_plane(self._map.place(p.keyframe_id, p.T_keyframe_body)) for p in (before, now))
-        self._step = between_planar(a, b)
-        self._step_s = (now.stamp_ns - before.stamp_ns) * 1e-9
 
     def _add_keyframe(
         self,

@@ -28,6 +28,7 @@ from odomap.geometry.planar import (
     to_plane,
     transform_planar,
 )
+from odomap.kernels import kernel
 from odomap.lidar.grid import Evidence, OccupancyGrid
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.maps.map import Map
@@ -65,11 +66,10 @@ class Submap:
 
     def insert(self, keyframe_id: int, scan: ScanPoints, x_anchor_body: Array) -> None:
         """Add the scan of a keyframe."""
-        hits, between, free, sensor = (
-            transform_planar(x_anchor_body, points)
-            for points in (scan.hits, scan.between, scan.free, scan.origin[None])
-        )
-        self.grid.insert(sensor[0], hits, between=between, free=free)
+        parts = scan.hits, scan.between, scan.free, scan.origin[None]
+        points = transform_planar(x_anchor_body, np.concatenate(parts))
+        n, m = len(scan.hits), len(scan.hits) + len(scan.between)
+        self.grid.insert(points[-1], points[:n], between=points[n:m], free=points[m:-1])
         self.keyframe_ids.append(keyframe_id)
         self.x_anchor_keyframe = x_anchor_body
 
@@ -198,6 +198,37 @@ class Submaps:
 
 
 def fused(covariance: Array, information: Array) -> Array:
-    """Return (P⁻¹ + Λ)⁻¹ = (I + P Λ)⁻¹ P, for which neither need be regular."""
-    both = np.linalg.solve(np.eye(3) + covariance @ information, covariance)
-    return np.asarray(0.5 * (both + both.T))
+    """Return (P⁻¹ + Λ)⁻¹ = (I + P Λ)⁻¹ P (3, 3), for which neither need be regular."""
+    both = np.empty((3, 3))
+    fuse(covariance, information, both)
+    return both
+
+
+@kernel
+def fuse(P: Array, information: Array, both: Array) -> None:
+    """both ← X with (I + P Λ) X = P, by elimination with the largest pivots; made symmetric."""
+    A = np.empty((3, 6))
+    for i in range(3):
+        for j in range(3):
+            A[i, 3 + j] = P[i, j]
+            A[i, j] = 1.0 if i == j else 0.0
+            for k in range(3):
+                A[i, j] += P[i, k] * information[k, j]
+    for i in range(3):
+        best = i
+        for k in range(i + 1, 3):
+            best = k if abs(A[k, i]) > abs(A[best, i]) else best
+        for j in range(6):
+            A[i, j], A[best, j] = A[best, j], A[i, j]
+        for k in range(3):
+            share = A[k, i] / A[i, i]
+            for j in range(i, 6):
+                A[k, j] -= share * A[i, j] if k != i else 0.0
+    for i in range(3):
+        for j in range(3):
+            both[i, j] = 0.5 * (A[i, 3 + j] / A[i, i] + A[j, 3 + i] / A[j, j])
+
+
+def warm_up() -> None:
+    """Compile the kernels of this module."""
+    fused(np.eye(3), np.eye(3))
