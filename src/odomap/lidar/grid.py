@@ -211,7 +211,7 @@ class OccupancyGrid:
     def _hold(self, *points: Array) -> None:
         """Grow until points (N, 2) lie inside."""
         box = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
-        if not all([widen_box(each, box) for each in points]):
+        if not all(widen_box(each, box) for each in points):
             raise ValueError("a point of a scan is not finite")
         cells = (box - self.origin) / self.resolution
         (left, down), (right, up) = cells.tolist()
