@@ -117,6 +117,14 @@ def test_quaternions_round_trip_and_are_canonical():
     np.testing.assert_allclose(back, same * q, atol=1e-15)
 
 
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_quaternion_of_one_rotation_is_that_of_a_stack_to_the_last_bit(angle):
+    axes = np.concatenate([np.eye(3), np.random.default_rng(5).normal(size=(20, 3))])
+    R = lie.so3_exp(angle * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    one_by_one = [lie.quaternion_from_rotation(each) for each in R]
+    np.testing.assert_array_equal(lie.quaternion_from_rotation(R), one_by_one)
+
+
 def test_quaternion_of_a_known_turn():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     half = np.sqrt(0.5)

@@ -29,6 +29,12 @@ def test_to_space_and_back(rng):
     np.testing.assert_allclose(T[:, 2], np.tile([0, 0, 1, 0], (20, 1)))
 
 
+def test_one_pose_is_as_one_of_many(rng):
+    x = rng.uniform(-3, 3, (20, 3))
+    np.testing.assert_allclose([from_plane(each) for each in x], from_plane(x), atol=1e-15)
+    np.testing.assert_allclose([to_plane(T) for T in from_plane(x)], x, atol=1e-15)
+
+
 def test_composing_is_multiplying(rng):
     for _ in range(20):
         a, b = rng.uniform(-3, 3, (2, 3))

@@ -159,3 +159,30 @@ def test_velocity_is_the_twist_per_second(map):
 def test_an_empty_path_is_a_trajectory_too():
     path = Path(Map())
     assert len(path.trajectory()) == len(path.trajectory_live()) == len(path) == 0
+
+
+def test_the_path_of_all_frames_is_that_of_each(map):
+    """Also of frames that hang from a keyframe with units of its own, or one that was culled."""
+    map.add_keyframe(Keyframe(3, 300), pose(3), covariance=covariance(3), scale=1.7)
+    path = Path(map)
+    for n in range(12):
+        path.append(Placed(1000 + n, n % 4, pose(20 + n), covariance(20 + n)))
+    map.cull_keyframes([1])
+    found = path.trajectory()
+    for n in range(12):
+        frame = path[n]
+        placed = map.place(frame.keyframe_id, frame.T_keyframe_body)
+        np.testing.assert_allclose(found.Ts_world_body[n], placed, atol=1e-12)
+        np.testing.assert_allclose(found.covariances[n], path.covariance(frame), rtol=1e-9)
+
+
+def test_the_last_pose_is_as_known_now_whatever_became_of_it(map):
+    path = Path(map)
+    np.testing.assert_array_equal(path.last_pose(), np.eye(4))
+    path.append(Placed(150, 1, pose(7), covariance(7)))
+    path.last_pose()[:] = 0.0  # the caller's own
+    np.testing.assert_allclose(path.last_pose(), pose(1) @ pose(7), atol=1e-12)
+    path.replace_last(Placed(150, 2, pose(8), covariance(8)))
+    np.testing.assert_allclose(path.last_pose(), pose(2) @ pose(8), atol=1e-12)
+    path.append_late(Placed(160, 0, pose(9), covariance(9)))
+    np.testing.assert_allclose(path.last_pose(), pose(0) @ pose(9), atol=1e-12)

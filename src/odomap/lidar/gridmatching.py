@@ -19,12 +19,14 @@ Reference: S. Kohlbrecher et al., "A flexible and scalable SLAM system with full
 estimation", SSRR 2011; R. Keys, "Cubic convolution interpolation", IEEE ASSP 29(6), 1981.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
+from odomap.lidar.fusion import fused
 from odomap.lidar.grid import Cells, Hits, OccupancyGrid
 
 __all__ = ["GridMatch", "match_to_grid"]
@@ -43,6 +45,7 @@ OFF_LINE = 3.0
 """How many of these off it counts half: it may be of another surface."""
 IN_COMMON_LINES = 0.06, 0.0007
 """What all points of a scan are off by together then: in cells, in radians."""
+NOTHING = np.float32(0.0)
 REFINED = 6
 STEPS = 20
 LONGEST = 2.0, 0.1
@@ -106,31 +109,60 @@ def match_to_grid(
 
 
 def _with_cells(H: Array, resolution: float, common: tuple[float, float]) -> Array:
-    """(H⁻¹ + D)⁻¹ = H - H (H + D⁻¹)⁻¹ H, which H need not be regular for."""
-    sigma = np.array([common[0] * resolution, common[0] * resolution, common[1]])
-    return np.asarray(H - H @ np.linalg.solve(H + np.diag(sigma**-2), H))
+    """(H⁻¹ + D)⁻¹, which H need not be regular for."""
+    variance, turning = (common[0] * resolution) ** 2, common[1] ** 2
+    D = np.array([[variance, 0.0, 0.0], [0.0, variance, 0.0], [0.0, 0.0, turning]])
+    return fused(H, D)
 
 
 def _turn(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
+    c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-@kernel
-def degree(log_odds: Cells, y: int, x: int, limit: float) -> float:
-    """m = max(l, 0) / l_max; 0 outside."""
-    if y < 0 or x < 0 or y >= log_odds.shape[0] or x >= log_odds.shape[1]:
-        return 0.0
-    return float(max(log_odds[y, x], 0.0) / limit)
+@kernel(reorder=True)
+def cubic(t: float) -> tuple[float, float, float, float]:
+    """Weights of the four values around, at 0 ≤ t < 1 from the second."""
+    first, second = ((-0.5 * t + 1.0) * t - 0.5) * t, (1.5 * t - 2.5) * t * t + 1.0
+    return first, second, ((-1.5 * t + 2.0) * t + 0.5) * t, (0.5 * t - 0.5) * t * t
 
 
-@kernel
-def cubic(t: float, w: Array, d: Array) -> None:
-    """Weights of the four values around, and those of the slope, at 0 ≤ t < 1 from the second."""
-    w[0], d[0] = ((-0.5 * t + 1.0) * t - 0.5) * t, (-1.5 * t + 2.0) * t - 0.5
-    w[1], d[1] = (1.5 * t - 2.5) * t * t + 1.0, (4.5 * t - 5.0) * t
-    w[2], d[2] = ((-1.5 * t + 2.0) * t + 0.5) * t, (-4.5 * t + 4.0) * t + 0.5
-    w[3], d[3] = (0.5 * t - 0.5) * t * t, (1.5 * t - 1.0) * t
+@kernel(reorder=True)
+def cubic_slope(t: float) -> tuple[float, float, float, float]:
+    """Weights of the same four in the slope there."""
+    first, second = (-1.5 * t + 2.0) * t - 0.5, (4.5 * t - 5.0) * t
+    return first, second, (-4.5 * t + 4.0) * t + 0.5, (1.5 * t - 1.0) * t
+
+
+@kernel(reorder=True)
+def between_cells(
+    cells: Cells, width: int, height: int, u: float, v: float
+) -> tuple[float, float, float]:
+    """max(l, 0) and its slopes along x and y, at (u, v) from the middle of the first; 0 outside."""
+    column, row = int(np.floor(u)), int(np.floor(v))
+    w, w_y = cubic(u - column), cubic(v - row)
+    d, d_y = cubic_slope(u - column), cubic_slope(v - row)
+    value, x, y = 0.0, 0.0, 0.0
+    if 0 < column < width - 2 and 0 < row < height - 2:
+        at = (row - 1) * width + column - 1
+        for k in range(4):
+            along, slope = 0.0, 0.0
+            for j in range(4):
+                occupied = max(cells[np.uint64(at + j)], NOTHING)  # unsigned: none is below 0
+                along += w[j] * occupied
+                slope += d[j] * occupied
+            value += w_y[k] * along
+            x += w_y[k] * slope
+            y += d_y[k] * along
+            at += width
+        return value, x, y
+    for k in range(max(0, 1 - row), min(4, height + 1 - row)):
+        for j in range(max(0, 1 - column), min(4, width + 1 - column)):
+            occupied = max(cells[(row - 1 + k) * width + column - 1 + j], NOTHING)
+            value += w_y[k] * w[j] * occupied
+            x += w_y[k] * d[j] * occupied
+            y += d_y[k] * w[j] * occupied
+    return value, x, y
 
 
 @kernel
@@ -158,7 +190,7 @@ def solve_step(H: Array, g: Array, step: Array) -> bool:
     return True
 
 
-@kernel
+@kernel(reorder=True)
 def match_kernel(
     log_odds: Cells,
     origin: Array,
@@ -173,29 +205,17 @@ def match_kernel(
     said: Array,
 ) -> None:
     """x ← argmin Σ (1 - m(T_x p))² / σ² + |x - x̂|²_Λ; H of the sum; Σ m, points on walls."""
-    w_x, w_y, d_x, d_y = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     g, A, b, step = np.empty(3), np.empty((3, 3)), np.empty(3), np.zeros(3)
-    cells = 1.0 / resolution
+    (height, width), cells = log_odds.shape, log_odds.reshape(-1)
     for n in range(STEPS + 1):
         c, s = np.cos(x[2]), np.sin(x[2])
         H[:], g[:], said[:] = 0.0, 0.0, 0.0
         for i in range(len(points)):
             p_x, p_y = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
-            u = (x[0] + p_x - origin[0]) * cells - 0.5
-            v = (x[1] + p_y - origin[1]) * cells - 0.5
-            column, row = int(np.floor(u)), int(np.floor(v))
-            cubic(u - column, w_x, d_x)
-            cubic(v - row, w_y, d_y)
-            m, m_x, m_y = 0.0, 0.0, 0.0
-            for k in range(4):
-                along, slope = 0.0, 0.0
-                for j in range(4):
-                    value = degree(log_odds, row - 1 + k, column - 1 + j, limit)
-                    along += w_x[j] * value
-                    slope += d_x[j] * value
-                m += w_y[k] * along
-                m_x += w_y[k] * slope * cells
-                m_y += d_y[k] * along * cells
+            u = (x[0] + p_x - origin[0]) / resolution - 0.5
+            v = (x[1] + p_y - origin[1]) / resolution - 0.5
+            m, m_x, m_y = between_cells(cells, width, height, u, v)
+            m, m_x, m_y = m / limit, m_x / (limit * resolution), m_y / (limit * resolution)
             n_x, n_y = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
             if n_x != 0.0 or n_y != 0.0:
                 across = m_x * n_x + m_y * n_y
@@ -224,7 +244,7 @@ def match_kernel(
                 b[k] += prior[k, j] * off
         if n == STEPS or not solve_step(A, b, step):
             return
-        length = np.hypot(step[0], step[1]) * cells
+        length = np.hypot(step[0], step[1]) / resolution
         share = min(1.0, LONGEST[0] / max(length, 1e-12), LONGEST[1] / max(abs(step[2]), 1e-12))
         if length < ENOUGH[0] and abs(step[2]) < ENOUGH[1]:
             return

@@ -32,6 +32,7 @@ from odomap.geometry.planar import (
 from odomap.geometry.pose import SE3
 from odomap.lidar.branchbound import GridPyramid
 from odomap.lidar.correlative import search_near
+from odomap.lidar.fusion import fused
 from odomap.lidar.gridmatching import GridMatch, match_to_grid
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.maps.edges import LOOP
@@ -43,7 +44,7 @@ from odomap.system.looking import Clock
 from odomap.system.path import Path, Placed
 from odomap.system.scanconfig import ScanTrackingConfig
 from odomap.system.scanrecognition import recognise_scan
-from odomap.system.submaps import Submap, Submaps, fused
+from odomap.system.submaps import Submap, Submaps
 
 __all__ = ["ScanTracker"]
 

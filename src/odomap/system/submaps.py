@@ -28,13 +28,13 @@ from odomap.geometry.planar import (
     to_plane,
     transform_planar,
 )
-from odomap.kernels import kernel
+from odomap.lidar.fusion import fused
 from odomap.lidar.grid import Evidence, OccupancyGrid
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.maps.map import Map
 from odomap.system.scanconfig import SubmapConfig
 
-__all__ = ["SUBMAP", "Submap", "Submaps", "fused"]
+__all__ = ["SUBMAP", "Submap", "Submaps"]
 
 Array = NDArray[np.float64]
 
@@ -195,40 +195,3 @@ class Submaps:
         for submap in self.active:
             submap.x_anchor_body = compose_planar(submap.x_anchor_body, motion)
             submap.covariance = fused(submap.covariance, information)
-
-
-def fused(covariance: Array, information: Array) -> Array:
-    """Return (P⁻¹ + Λ)⁻¹ = (I + P Λ)⁻¹ P (3, 3), for which neither need be regular."""
-    both = np.empty((3, 3))
-    fuse(covariance, information, both)
-    return both
-
-
-@kernel
-def fuse(P: Array, information: Array, both: Array) -> None:
-    """both ← X with (I + P Λ) X = P, by elimination with the largest pivots; made symmetric."""
-    A = np.empty((3, 6))
-    for i in range(3):
-        for j in range(3):
-            A[i, 3 + j] = P[i, j]
-            A[i, j] = 1.0 if i == j else 0.0
-            for k in range(3):
-                A[i, j] += P[i, k] * information[k, j]
-    for i in range(3):
-        best = i
-        for k in range(i + 1, 3):
-            best = k if abs(A[k, i]) > abs(A[best, i]) else best
-        for j in range(6):
-            A[i, j], A[best, j] = A[best, j], A[i, j]
-        for k in range(3):
-            share = A[k, i] / A[i, i]
-            for j in range(i, 6):
-                A[k, j] -= share * A[i, j] if k != i else 0.0
-    for i in range(3):
-        for j in range(3):
-            both[i, j] = 0.5 * (A[i, 3 + j] / A[i, i] + A[j, 3 + i] / A[j, j])
-
-
-def warm_up() -> None:
-    """Compile the kernels of this module."""
-    fused(np.eye(3), np.eye(3))
