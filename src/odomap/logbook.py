@@ -77,7 +77,9 @@ class Logbook:
         if self.map is not None:
             self._keyframes.append(self.map.num_keyframes)
             self._landmarks.append(self.map.num_landmarks)
-        self.estimates.append(dataclasses.replace(estimate, tracks=None))
+        if estimate.tracks is not None:
+            estimate = dataclasses.replace(estimate, tracks=None)
+        self.estimates.append(estimate)
         self._track_ms.append(1000.0 * seconds)
 
     @property

@@ -299,8 +299,8 @@ def remove(path: Path) -> None:
 
 
 def _row(estimate: Estimate) -> str:
-    x, y, z = estimate.T_world_body.t
-    qw, qx, qy, qz = estimate.T_world_body.quaternion
+    x, y, z = estimate.T_world_body.t.tolist()
+    qw, qx, qy, qz = estimate.T_world_body.quaternion.tolist()
     numbers = " ".join(f"{value:.9f}" for value in (x, y, z, qx, qy, qz, qw))
     return f"{format_stamp(estimate.stamp_ns)} {numbers}\n"
 

@@ -78,7 +78,7 @@ class _Motion:
         """Raise unless `given` is of the group to 1e-6, then make it so exactly, in place."""
         name, d = type(self).__name__, self._space
         last = _IDENTITY[self._size][d:]
-        if self._size > d and np.abs(given[d:] - last).max() > 1e-9:
+        if given[d:].tolist() != last.tolist() and np.abs(given[d:] - last).max() > 1e-9:
             raise InputError(f"{name}: last row is {given[d].tolist()}, must be 0 … 0 1")
         scale = self._scale_of(given)
         R = given[:d, :d] / scale

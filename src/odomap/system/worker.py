@@ -177,12 +177,13 @@ class Worker(ABC):
 
     def _tell_map(self) -> None:
         """Tell about the map if it has changed since last told."""
-        with self.stages.map.lock:
-            m = self.stages.map
+        m = self.stages.map
+        if m.version == self._told_version:
+            return
+        with m.lock:
             state = MapState(m.version, m.epoch, m.num_keyframes, m.num_landmarks)
-        if state.version != self._told_version:
-            self._told_version = state.version
-            self._tell("on_map", self.on_map, state)
+        self._told_version = state.version
+        self._tell("on_map", self.on_map, state)
 
 
 class InlineWorker(Worker):
