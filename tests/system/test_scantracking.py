@@ -52,6 +52,17 @@ def test_a_round_of_a_room_ends_where_it_began(seed, odometry):
     assert result.map.keyframe(0).scan is not None
 
 
+@pytest.mark.parametrize("late", [4, 8])
+def test_odometry_of_another_instant_is_noticed(late):
+    # Standing, as odometry has it, while the body sets off, and then too fast.
+    path = around(100)
+    made = frames(path, seed=late)
+    wheels = [frame.odometry for frame in made]
+    wheels[30 : 30 + late] = [wheels[30]] * late
+    _, estimates = played([replace(f, odometry=w) for f, w in zip(made, wheels, strict=True)])
+    assert off(estimates, path).max() < 0.05
+
+
 def test_along_a_corridor_the_covariance_grows_and_holds_the_error():
     path = np.column_stack([np.linspace(0, 10, 101), np.zeros(101), np.zeros(101)])
     _, estimates = played(frames(path, walls=CORRIDOR))

@@ -8,10 +8,11 @@ free and cells not known are not. Between the cells' middles m is a cubic surfac
 by Gauss-Newton from a pose a few cells off. What is predicted, x̂ with information Λ, keeps the pose
 where walls do not say enough, as along a corridor. That cells of one wall differ says nothing of
 the way along it: of the slope at a point only what is across its surface counts, ∇m ← n nᵀ ∇m. So
-the Hessian H, what the scan says, is small in that direction. And a wall is known by its cells, and
-may be anywhere in them, the same for all points on it: with D of a quarter of a cell, the
-information is (H⁻¹ + D)⁻¹. Where a grid keeps the means μ of points in its cells, the last steps
-are from points to lines, min Σ ρ(nᵀ(T_x p_i - μ) / σ) + ..., and D is a part of that.
+the Hessian H, what the scan says, is small in that direction; and as normals are a little off, by
+σ_n, n nᵀ seems to say σ_n² t tᵀ along the surface, too, which is taken off again. A wall is known
+by its cells, and may be anywhere in them, the same for all points on it: with D of a quarter of a
+cell, the information is (H⁻¹ + D)⁻¹. Where a grid keeps the means μ of points in its cells, the
+last steps are from points to lines, min Σ ρ(nᵀ(T_x p_i - μ) / σ) + ..., and D is a part of that.
 
 Cost: 16 cells for each point and step.
 
@@ -26,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.fusion import fused
 from odomap.lidar.grid import Cells, Hits, OccupancyGrid
+from odomap.lidar.scans import ScanPoints
 
-__all__ = ["GridMatch", "match_to_grid"]
+__all__ = ["GridMatch", "lay_on_grid", "match_to_grid"]
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,8 @@ OFF_LINE = 3.0
 IN_COMMON_LINES = 0.06, 0.0007
 """What all points of a scan are off by together then: in cells, in radians."""
 NOTHING = np.float32(0.0)
+NORMAL = 0.05
+"""Standard deviation of a normal, radians."""
 REFINED = 6
 STEPS = 20
 LONGEST = 2.0, 0.1
@@ -79,6 +82,7 @@ def match_to_grid(
     x_guess: Array,
     information: Array | None = None,
     x_predicted: Array | None = None,
+    weights: Array | None = None,
 ) -> GridMatch:
     """Lay a scan onto a grid.
 
@@ -89,30 +93,63 @@ def match_to_grid(
         x_guess: (3,) x, y, heading of the body in the grid, to begin with.
         information: (3, 3) of a prediction, tangent as that of the result; None says nothing.
         x_predicted: (3,) what is predicted; default the guess.
+        weights: (N,) how much points without a normal say; default 1.
     """
     x = np.array(x_guess, float)
     expected = np.array(x if x_predicted is None else x_predicted, float)
     turned = _turn(expected[2])
     prior = np.zeros((3, 3)) if information is None else turned @ information @ turned.T
-    H, said = np.zeros((3, 3)), np.zeros(2)
+    H, slide, said = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(2)
     place = grid.origin, grid.resolution, grid.evidence.limit
     seen = points_body, normals_body
-    match_kernel(grid.log_odds, *place, *seen, expected, prior, x, H, said)
+    weights = np.ones(len(points_body)) if weights is None else weights
+    match_kernel(grid.log_odds, *place, *seen, weights, expected, prior, x, H, slide, said)
     common = IN_COMMON
     if grid.hits is not None:
         cells = grid.log_odds, grid.hits, grid.origin, grid.resolution
-        refine_kernel(*cells, *seen, expected, prior, x, H)
+        refine_kernel(*cells, *seen, expected, prior, x, H, slide)
         common = IN_COMMON_LINES
-    turned = _turn(x[2])
-    information = _with_cells(turned.T @ H @ turned, grid.resolution, common)
+    x, root = _without_slide(x, expected, H, slide)
+    information = _with_cells(_turn(x[2]).T @ root, grid.resolution, common)
     return GridMatch(x, information, *(said / len(points_body)))
 
 
-def _with_cells(H: Array, resolution: float, common: tuple[float, float]) -> Array:
-    """(H⁻¹ + D)⁻¹, which H need not be regular for."""
-    variance, turning = (common[0] * resolution) ** 2, common[1] ** 2
-    D = np.array([[variance, 0.0, 0.0], [0.0, variance, 0.0], [0.0, 0.0, turning]])
-    return fused(H, D)
+def lay_on_grid(
+    scan: ScanPoints,
+    grid: OccupancyGrid,
+    x_guess: Array,
+    information: Array | None = None,
+    x_predicted: Array | None = None,
+) -> GridMatch:
+    """Lay a scan onto a grid; arguments and result as those of `match_to_grid`."""
+    guess = x_guess, information, x_predicted
+    return match_to_grid(grid, scan.hits, scan.normals, *guess, weights=scan.weights)
+
+
+def _with_cells(root: Array, resolution: float, common: tuple[float, float]) -> Array:
+    """(H⁻¹ + D)⁻¹ = R (I + Rᵀ D R)⁻¹ Rᵀ of H = R Rᵀ, which need not be regular."""
+    sigma = np.array([[common[0] * resolution], [common[0] * resolution], [common[1]]])
+    inside = np.linalg.inv(np.linalg.cholesky(np.eye(3) + (sigma * root).T @ (sigma * root)))
+    half = root @ inside.T
+    return np.asarray(half @ half.T)
+
+
+def _without_slide(x: Array, expected: Array, H: Array, slide: Array) -> tuple[Array, Array]:
+    """Return the pose, and R of H = R Rᵀ, without what errors of normals say along surfaces.
+
+    With H v = λ S v, S what a scan would say were all its normals turned by a right angle, errors
+    of normals make up σ² of each λ. Errors in the variables of a regression pull what it finds by
+    the share they have in these; where they are all there is, what is expected stays.
+    """
+    factor = np.linalg.cholesky(slide + (1e-6 * np.trace(H) + 1e-9) * np.eye(3))
+    inverse = np.linalg.inv(factor)
+    values, axes = np.linalg.eigh(inverse @ H @ inverse.T)
+    true = np.maximum(values - NORMAL**2, 0.0)
+    off = x - expected
+    off[2] -= 2.0 * np.pi * np.round(off[2] / (2.0 * np.pi))
+    share = true / np.maximum(values, NORMAL**2)
+    kept = inverse.T @ axes @ (share * (axes.T @ (factor.T @ off)))
+    return expected + kept, np.asarray(factor @ axes * np.sqrt(true))
 
 
 def _turn(angle: float) -> Array:
@@ -190,6 +227,19 @@ def solve_step(H: Array, g: Array, step: Array) -> bool:
     return True
 
 
+@kernel
+def add_square(H: Array, t_x: float, t_y: float, p_x: float, p_y: float, w: float) -> None:
+    """H ← H + w J Jᵀ of a point p that moves along t."""
+    turn = t_y * p_x - t_x * p_y
+    H[0, 0] += w * t_x * t_x
+    H[0, 1] += w * t_x * t_y
+    H[0, 2] += w * t_x * turn
+    H[1, 1] += w * t_y * t_y
+    H[1, 2] += w * t_y * turn
+    H[2, 2] += w * turn * turn
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+
+
 @kernel(reorder=True)
 def match_kernel(
     log_odds: Cells,
@@ -198,18 +248,21 @@ def match_kernel(
     limit: float,
     points: Array,
     normals: Array,
+    weights: Array,
     x_guess: Array,
     prior: Array,
     x: Array,
     H: Array,
+    slide: Array,
     said: Array,
 ) -> None:
-    """x ← argmin Σ (1 - m(T_x p))² / σ² + |x - x̂|²_Λ; H of the sum; Σ m, points on walls."""
+    """x ← argmin Σ (1 - m(T_x p))² / σ² + |x - x̂|²_Λ; H of the sum, and as it would be along the
+    surfaces; Σ m, points on walls."""
     g, A, b, step = np.empty(3), np.empty((3, 3)), np.empty(3), np.zeros(3)
     (height, width), cells = log_odds.shape, log_odds.reshape(-1)
     for n in range(STEPS + 1):
         c, s = np.cos(x[2]), np.sin(x[2])
-        H[:], g[:], said[:] = 0.0, 0.0, 0.0
+        H[:], slide[:], g[:], said[:] = 0.0, 0.0, 0.0, 0.0
         for i in range(len(points)):
             p_x, p_y = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
             u = (x[0] + p_x - origin[0]) / resolution - 0.5
@@ -220,19 +273,13 @@ def match_kernel(
             if n_x != 0.0 or n_y != 0.0:
                 across = m_x * n_x + m_y * n_y
                 m_x, m_y = across * n_x, across * n_y
+                add_square(slide, -across * n_y, across * n_x, p_x, p_y, 1.0 / SIGMA**2)
             said[0] += m
             said[1] += m > ON_WALL
-            turn = m_y * p_x - m_x * p_y
-            H[0, 0] += m_x * m_x
-            H[0, 1] += m_x * m_y
-            H[0, 2] += m_x * turn
-            H[1, 1] += m_y * m_y
-            H[1, 2] += m_y * turn
-            H[2, 2] += turn * turn
-            g[0] -= m_x * (1.0 - m)
-            g[1] -= m_y * (1.0 - m)
-            g[2] -= turn * (1.0 - m)
-        H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+            add_square(H, m_x, m_y, p_x, p_y, weights[i])
+            g[0] -= weights[i] * m_x * (1.0 - m)
+            g[1] -= weights[i] * m_y * (1.0 - m)
+            g[2] -= weights[i] * (m_y * p_x - m_x * p_y) * (1.0 - m)
         for k in range(3):
             b[k] = g[k] / SIGMA**2
             for j in range(3):
@@ -282,13 +329,15 @@ def refine_kernel(
     prior: Array,
     x: Array,
     H: Array,
+    slide: Array,
 ) -> None:
-    """x ← argmin Σ ρ(nᵀ(T_x p - μ)/σ) + |x - x̂|²_Λ, where p has a normal; H of the sum."""
+    """x ← argmin Σ ρ(nᵀ(T_x p - μ)/σ) + |x - x̂|²_Λ, where p has a normal; H of the sum, and as it
+    would be along the surfaces."""
     b, A, step, mean = np.empty(3), np.empty((3, 3)), np.zeros(3), np.zeros(2)
     J = np.empty(3)
     for _ in range(REFINED):
         c, s = np.cos(x[2]), np.sin(x[2])
-        H[:], b[:] = 0.0, 0.0
+        H[:], slide[:], b[:] = 0.0, 0.0, 0.0
         for i in range(len(points)):
             n_x, n_y = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
             if n_x == 0.0 and n_y == 0.0:
@@ -304,6 +353,7 @@ def refine_kernel(
                 b[k] += w * J[k] * off
                 for j in range(3):
                     H[k, j] += w * J[k] * J[j]
+            add_square(slide, -n_y, n_x, p_x, p_y, w)
         for k in range(3):
             for j in range(3):
                 A[k, j] = H[k, j] + prior[k, j]

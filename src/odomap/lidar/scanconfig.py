@@ -22,7 +22,8 @@ class ScanConfig:
     """Distance of neighbouring points from which on they are not of one surface, metres."""
     ratio: Positive = 10.0
     """The same, in distances of the beams there: how flat a surface may be seen."""
-
+    grain: Positive = 0.05
+    """Distance of beams from which on a point of no surface counts less, metres."""
     baseline: Positive = 0.25
     """How far to either side of a point a surface is looked at for its normal, metres."""
     bend: Positive = 0.5

@@ -44,6 +44,8 @@ class ScanPoints:
         origin: (2,) the scanner.
         hits: (N, 2) where beams came back from, metres.
         normals: (N, 2) of unit length across the surfaces there, zero where there is none.
+        weights: (N,) how much each says: less than 1 for those of no surface far away, which may be
+            anywhere between beams.
         between: (M, 2) points on the surfaces between them.
         free: (F, 2) how far the way is free where nothing came back.
         num_beams: beams of the scanner.
@@ -53,6 +55,7 @@ class ScanPoints:
     origin: Array
     hits: Array
     normals: Array
+    weights: Array
     between: Array
     free: Array
     num_beams: int
@@ -108,10 +111,15 @@ class Beams:
         between = np.empty((count, 2))
         fill_between(p, parts, between)
         find_normals(p, is_hit, is_one, config.baseline, np.cos(config.bend), normals)
+        hits, normals = p.compress(is_hit, 0), normals.compress(is_hit, 0)
+        apart = self._step * ranges.compress(is_hit)
+        of_none = ~normals.any(axis=1)
+        weights = np.where(of_none, np.minimum(1.0, (config.grain / apart) ** 2), 1.0)
         return ScanPoints(
             origin=self._origin,
-            hits=p.compress(is_hit, 0),
-            normals=normals.compress(is_hit, 0),
+            hits=hits,
+            normals=normals,
+            weights=weights,
             between=between,
             free=self._free(ranges),
             num_beams=len(ranges),
@@ -217,13 +225,31 @@ def find_normals(
             if along >= straight * np.hypot(l_x, l_y) * np.hypot(r_x, r_y):
                 set_normal(normals, i, r_x - l_x, r_y - l_y)
             elif left < 2 and right == 2:
-                set_normal(normals, i, r_x, r_y)
+                set_normal_by(normals, p, is_hit, is_one, i, 1, baseline, straight)
             elif right < 2 and left == 2:
-                set_normal(normals, i, -l_x, -l_y)
+                set_normal_by(normals, p, is_hit, is_one, i, -1, baseline, straight)
         elif right == 2:
-            set_normal(normals, i, r_x, r_y)
+            set_normal_by(normals, p, is_hit, is_one, i, 1, baseline, straight)
         elif left == 2:
-            set_normal(normals, i, -l_x, -l_y)
+            set_normal_by(normals, p, is_hit, is_one, i, -1, baseline, straight)
+
+
+@kernel
+def set_normal_by(
+    normals: Array,
+    p: Array,
+    is_hit: Mask,
+    is_one: Mask,
+    i: int,
+    by: int,
+    baseline: float,
+    straight: float,
+) -> None:
+    """n_i ← that of the surface from the next point on, without p_i: were it across the way from
+    p_i itself, each point's noise would turn its normal, and all together push the body along."""
+    x, y, seen = way_along(p, is_hit, is_one, i + by, by, baseline, straight)
+    if seen > 0 and x * x + y * y >= baseline**2:
+        set_normal(normals, i, x, y)
 
 
 @kernel

@@ -30,7 +30,7 @@ from odomap.geometry.planar import (
     transform_planar,
 )
 from odomap.lidar.branchbound import GridPyramid
-from odomap.lidar.gridmatching import match_to_grid
+from odomap.lidar.gridmatching import lay_on_grid
 from odomap.lidar.scans import Beams
 from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
@@ -157,7 +157,7 @@ class ScanCloser:
             guess = between_planar(x_anchor, x)
             if np.linalg.norm(guess[:2] - submap.middle) > submap.radius + reach:
                 continue
-            turn = min(float(SIGMAS * np.sqrt(drift[2]) + 0.1), config.widest_rad)
+            turn = min(float(SIGMAS * np.sqrt(drift[2]) + config.least_rad), config.widest_rad)
             chosen.append(_Candidate(submap, guess, reach, turn))
             if len(chosen) == config.most:
                 self._next = index + 1
@@ -189,7 +189,7 @@ class ScanCloser:
                 T = from_plane(candidate.x_guess)
                 found.append(Loop(*ends, T, 0, False, reason))
                 continue
-            match = match_to_grid(submap.grid, scan.hits, scan.normals, best.x_grid_body)
+            match = lay_on_grid(scan, submap.grid, best.x_grid_body)
             count = round(match.on_walls * len(scan))
             free = submap.grid.share_in_free(transform_planar(match.x_grid_body, scan.hits))
             if free > config.in_free * (free + match.on_walls):

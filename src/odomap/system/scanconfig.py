@@ -50,6 +50,12 @@ class ScanTrackingConfig:
     """How far around it all poses are tried then, metres."""
     search_rad: NotNegative = 0.12
     """The same of the heading, radians."""
+    slip_m: Positive = 0.3
+    """How far around it all poses are tried where scan and odometry do not agree, metres."""
+    slip_rad: Positive = 0.4
+    """The same of the heading, radians."""
+    few_on_walls: Fraction = 0.5
+    """Share of beams on walls of the submap below which odometry is doubted."""
     min_hits: Count = 20
     """Beams that must come back for a scan to say anything."""
     min_on_walls: Fraction = 0.25
@@ -81,11 +87,13 @@ class ScanClosingConfig:
     """Submaps that it is searched for in."""
     apart: Count = 6
     """Keyframes between two that are tied to the same submap."""
-    least_reach: Positive = 0.5
-    """Half the side of the smallest window, metres."""
+    least_reach: Positive = 3.0
+    """Half the side of the smallest window, metres: odometry may have drifted more than it says."""
+    least_rad: Positive = 0.3
+    """Half the smallest range of headings, radians."""
     farthest: Positive = 7.0
     """Half the side of the largest window, metres."""
-    widest_rad: Positive = 0.5
+    widest_rad: Positive = 0.6
     """Half the largest range of headings, radians."""
     score: Fraction = 0.5
     """Share of the beams that must meet walls of the submap; those beside one count half."""

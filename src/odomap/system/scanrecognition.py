@@ -17,7 +17,7 @@ import numpy as np
 
 from odomap.geometry.planar import transform_planar
 from odomap.lidar.branchbound import Found, GridPyramid
-from odomap.lidar.gridmatching import GridMatch, match_to_grid
+from odomap.lidar.gridmatching import GridMatch, lay_on_grid
 from odomap.lidar.scans import ScanPoints
 from odomap.system.submaps import Submap
 
@@ -48,7 +48,7 @@ def recognise_scan(
     if best is None:
         return f"in none of {len(submaps)} submaps {score:.0%} of the scan meet walls"
     submap, found = best
-    match = match_to_grid(submap.grid, scan.hits, scan.normals, found.x_grid_body)
+    match = lay_on_grid(scan, submap.grid, found.x_grid_body)
     free = submap.grid.share_in_free(transform_planar(match.x_grid_body, scan.hits))
     if free > in_free * (free + match.on_walls):
         return f"where {match.on_walls:.0%} of the beams meet walls {free:.0%} end in the open"

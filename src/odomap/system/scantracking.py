@@ -33,7 +33,7 @@ from odomap.geometry.pose import SE3
 from odomap.lidar.branchbound import GridPyramid
 from odomap.lidar.correlative import search_near
 from odomap.lidar.fusion import fused
-from odomap.lidar.gridmatching import GridMatch, match_to_grid
+from odomap.lidar.gridmatching import GridMatch, lay_on_grid
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.maps.edges import LOOP
 from odomap.maps.estimate import Estimate, Status
@@ -49,6 +49,11 @@ from odomap.system.submaps import Submap, Submaps
 __all__ = ["ScanTracker"]
 
 Array = NDArray[np.float64]
+
+SURPRISE = 9.0
+"""Squared standard deviations off odometry from which on it is asked whether that is true."""
+MORE_ON_WALLS = 0.05
+"""Share of the beams that must meet walls elsewhere, and not where odometry leads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,15 +251,40 @@ class ScanTracker:
     def _match(self, scan: ScanPoints, is_known: bool) -> GridMatch:
         """Lay a scan onto the older active submap."""
         submap, config = self._submaps.active[0], self._config
-        x, prior = submap.x_anchor_body, np.asarray(np.linalg.inv(submap.covariance))
-        grid = submap.grid
+        grid, x = submap.grid, submap.x_anchor_body
         if self._is_lost and not is_known:
             found = GridPyramid(grid).search(scan.hits, x, config.lost_reach, np.pi, 0.4)
-            x = x if found is None else found.x_grid_body
-            return match_to_grid(grid, scan.hits, scan.normals, x)
+            return lay_on_grid(scan, grid, x if found is None else found.x_grid_body)
+        prior = np.asarray(np.linalg.inv(submap.covariance))
         if not is_known:
             x = search_near(grid, scan.hits, x, config.search, config.search_rad)
-        return match_to_grid(grid, scan.hits, scan.normals, x, prior, submap.x_anchor_body)
+        match = lay_on_grid(scan, grid, x, prior, submap.x_anchor_body)
+        off = between_planar(submap.x_anchor_body, match.x_grid_body)
+        if is_known and (match.on_walls < config.few_on_walls or off @ prior @ off > SURPRISE):
+            return self._match_anew(scan, match)
+        return match
+
+    def _match_anew(self, scan: ScanPoints, match: GridMatch) -> GridMatch:
+        """Look for a scan as if there was no odometry, as wheels slip, and some logs have it of
+        another instant; stay with a match unless clearly more of the scan meets walls elsewhere."""
+        submap, config = self._submaps.active[0], self._config
+        grid, expected = submap.grid, submap.x_anchor_body
+        x = search_near(grid, scan.hits, expected, config.slip_m, config.slip_rad)
+        wide = np.diag([config.slip_m, config.slip_m, config.slip_rad]) ** 2
+        prior = np.asarray(np.linalg.inv(submap.covariance + wide))
+        again = lay_on_grid(scan, grid, x, prior, expected)
+        if max(again.on_walls, match.on_walls) < config.few_on_walls:
+            window = expected, 2.0 * config.slip_m, 3.0 * config.slip_rad
+            found = GridPyramid(grid).search(scan.hits, *window, config.min_on_walls)
+            if found is not None:
+                x = found.x_grid_body
+                farther = lay_on_grid(scan, grid, x, prior, expected)
+                again = max(again, farther, key=lambda each: each.on_walls)
+        if again.on_walls < match.on_walls + MORE_ON_WALLS:
+            return match
+        self._submaps.move(np.zeros(3), wide)
+        self._since = self._since + wide
+        return again
 
     def _motion(self, frame: Frame) -> tuple[Array, Array, bool]:
         """Return the motion (3,) since the last frame, its noise (3, 3), and if it is measured."""
