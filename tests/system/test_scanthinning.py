@@ -8,10 +8,12 @@ import pytest
 from laserworlds import RIG, around, frames, in_first
 from lidar.rooms import OUTLINE, ROOM
 from odomap.files.mapfile import load_map, save_map
-from odomap.geometry.planar import to_plane
-from odomap.maps.edges import FOLDED
+from odomap.geometry.planar import between_planar, from_plane, lift_information, to_plane
+from odomap.maps.edges import FOLDED, LOOP, EdgeTable
 from odomap.system.config import preset
+from odomap.system.redundancy import ScanMap
 from odomap.system.scanconfig import ScanThinningConfig, SubmapConfig
+from odomap.system.scanthinning import _ties
 from odomap.system.slam import Slam
 from odomap.system.submaps import SUBMAP
 
@@ -124,3 +126,30 @@ def test_a_room_that_was_changed_is_mapped_again(path):
     assert counts[2] <= 1.3 * counts[1]
     assert counts[4] > counts[2] + 10
     assert system.finish().map.num_keyframes < 2.5 * counts[1]
+
+
+@pytest.mark.parametrize("is_tied", [True, False])
+def test_only_what_would_fall_apart_is_tied(is_tied):
+    """0 - 1 - 2 - 3, of which the middle goes; another edge from 0 to 3, or none."""
+    count = 4 if is_tied else 3
+    x = np.array([[0, 0, 0], [1, 0, 0.1], [2, 0.1, 0.2], [3, 0.3, 0.3]])
+    i, j = np.array([0, 1, 2, 0])[:count], np.array([1, 2, 3, 3])[:count]
+    between = np.array([between_planar(x[a], x[b]) for a, b in zip(i, j)])
+    edges = EdgeTable(
+        i,
+        j,
+        from_plane(between),
+        np.ones(count),
+        lift_information(np.tile(np.diag([4.0, 4.0, 9.0]), (count, 1, 1))),
+        (SUBMAP, SUBMAP, LOOP, FOLDED)[:count],
+    )
+    read = ScanMap((), np.zeros(0, np.int64), set(), np.arange(4), x, {}, edges)
+    ids, left = np.array([1, 2]), np.array([0, 3])
+    is_gone = np.isin(i, ids) | np.isin(j, ids)
+    tied = _ties(read, ids, is_gone, ~is_gone, left)
+    if is_tied:
+        assert tied.kind == ()
+        return
+    assert (tied.i.tolist(), tied.j.tolist(), tied.kind) == ([0], [3], (FOLDED,))
+    np.testing.assert_allclose(to_plane(tied.Ts_i_j[0]), x[3], atol=1e-6)
+    assert 1.0 < 4.0 / tied.information[0, 0, 0] < 4.0

@@ -1,18 +1,17 @@
 """Thinning a map of scans: submaps go that show nothing new, so that it grows with the space seen.
 
-A robot that goes round the same building all day adds submap after submap of what is known. One is
-redundant if nearly all of its scans are shown by enough older ones: with a keyframe close by, the
-beams on their walls, and hardly any that end where they are free. Where a wall was moved they do
-not show it, and the new submaps stay until there are enough. The oldest are kept: they have been
-tied to most others.
+A robot that goes round the same building all day adds submap after submap of what is known. Those
+go that are redundant (`redundancy`); the oldest stay, which have been tied to most others.
 
-With a redundant submap the keyframes go that are in no other. What their edges said of those that
-stay is folded into few edges (`backend/graphs/folding`); loops that the path contradicts say
-nothing. Frames that hung from them hang from the nearest of the older keyframes from then on. So
-poses and covariances stay as they are, and later corrections move all that lies together.
+With a redundant submap the keyframes go that are in no other, and all edges to them, but where
+nothing else ties what is left together: there they are folded into the surest edge that does
+(`backend/graphs/folding`). To keep all they said would make the path surer than it is, and worse:
+matches of many scans to the same walls are not independent. Frames that hung from
+these keyframes hang from the nearest of the older ones from then on. So poses and covariances stay
+as they are, and later corrections move all that lies together.
 
-Only submaps are looked at that are new, and a few others in turn, since what is close to what may
-have been corrected. Cost: some milliseconds per submap.
+Only submaps are looked at that are new, and one of the others in turn, since what is close to what
+may have been corrected. Cost: some milliseconds per submap.
 
 Reference: H. Kretzschmar, C. Stachniss, "Information-theoretic compression of pose graphs for
 laser-based SLAM", International Journal of Robotics Research 31(11), 2012.
@@ -23,24 +22,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.backend.graphs.components import connected_components
 from odomap.backend.graphs.folding import fold
 from odomap.backend.graphs.posegraph import PoseGraph
 from odomap.geometry.lie import se3_inverse
 from odomap.geometry.planar import (
     IN_PLANE,
-    between_planar,
     from_plane,
     lift_information,
     planar_matrix,
     to_plane,
-    transform_planar,
 )
 from odomap.geometry.se2 import se2_log
-from odomap.lidar.grid import OccupancyGrid, beside, is_wall
 from odomap.lidar.scans import Beams
 from odomap.maps.edges import FOLDED, GAP, LOOP, EdgeTable
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.system.redundancy import ScanMap, redundant
 from odomap.system.scanconfig import ScanThinningConfig
 from odomap.system.stages import Change, Closer, Job, Loop
 from odomap.system.submaps import SUBMAP, Submap, Submaps
@@ -53,10 +51,8 @@ Bool = NDArray[np.bool_]
 
 NEW, IN_TURN = 3, 1
 """Submaps that are looked at: so many of the newest, and of the others."""
-EVERY = 3
-"""Of the keyframes of a submap, and of the beams of a scan, those that are looked at."""
-FARTHEST = 12.0
-"""Beams that end farther away say little of a place, metres."""
+RECENT = 1
+"""Submaps that are not, since the path through them is not settled yet."""
 DOUBTED = 10.0
 """Standard deviations by which a loop contradicts the path that does not believe it."""
 
@@ -86,7 +82,7 @@ class ScanThinner:
         if not finished or finished[-1].anchor_id == self._newest:
             return job
         self._newest = finished[-1].anchor_id
-        if len(finished) <= self._config.covers:
+        if len(finished) <= self._config.covers + RECENT:
             return job
         return _Job(job, self._read(), self._submaps, self._beams, self._config)
 
@@ -94,11 +90,12 @@ class ScanThinner:
         """Read what is left to be done at the end."""
         return self._closer.last()
 
-    def _read(self) -> "_Read":
+    def _read(self) -> ScanMap:
         """Read the map, and choose the submaps that are looked at."""
         finished, active = tuple(self._submaps.finished), self._submaps.active
-        new = np.arange(max(len(finished) - NEW, 0), len(finished))
-        others = (self._next + np.arange(IN_TURN)) % len(finished)
+        last = len(finished) - RECENT
+        new = np.arange(max(last - NEW, 0), last)
+        others = (self._next + np.arange(IN_TURN)) % max(last, 1)
         self._next += IN_TURN
         with self._map.lock:
             ids, edges = self._map.keyframe_ids, self._map.edges()
@@ -107,39 +104,7 @@ class ScanThinner:
         held = {k for submap in active for k in submap.keyframe_ids}
         gaps = np.flatnonzero(np.array(edges.kind, str) == GAP)
         held |= {int(ids[0]), *edges.i[gaps].tolist(), *edges.j[gaps].tolist()}
-        return _Read(finished, np.union1d(new, others), held, ids, x, keyframes, edges)
-
-
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """What was read of a map.
-
-    Attributes:
-        finished: the submaps, in order.
-        looked_at: (n,) which of them may go.
-        held: keyframes that must stay.
-        ids: (K,) of living keyframes, ascending.
-        x: (K, 3) where they are.
-        keyframes: by id.
-        edges: all there are.
-    """
-
-    finished: tuple[Submap, ...]
-    looked_at: Index
-    held: set[int]
-    ids: Index
-    x: Array
-    keyframes: dict[int, Keyframe]
-    edges: EdgeTable
-
-    def place(self, k: int) -> Array:
-        """Return where (3,) a living keyframe is."""
-        return np.asarray(self.x[np.searchsorted(self.ids, k)])
-
-    def rows(self, ids: list[int] | Index) -> Index:
-        """Return the rows of those of some keyframes that live."""
-        some = np.asarray(ids, np.int64)
-        return np.searchsorted(self.ids, some[np.isin(some, self.ids)])
+        return ScanMap(finished, np.union1d(new, others), held, ids, x, keyframes, edges)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,13 +112,13 @@ class _Job:
     """A closer's job, and submaps to be looked at."""
 
     job: Job | None
-    read: _Read
+    read: ScanMap
     submaps: Submaps
     beams: Beams
     config: ScanThinningConfig
 
     def solve(self) -> "_Thinned":
-        """Do the closer's job, find what is redundant, and fold its edges."""
+        """Do the closer's job, find what is redundant, and plan what becomes of the map."""
         change = None if self.job is None else self.job.solve()
         gone = redundant(self.read, self.beams, self.config)
         plan = _plan(self.read, gone) if gone else None
@@ -208,77 +173,7 @@ class _Thinned:
         self.submaps.finished[:] = [s for s in self.submaps.finished if s.anchor_id not in names]
 
 
-def redundant(read: _Read, beams: Beams, config: ScanThinningConfig) -> list[Submap]:
-    """Return the submaps that older ones show.
-
-    Args:
-        read: of the map.
-        beams: of the laser.
-        config: when.
-    """
-    gone: list[int] = []
-    look = _Look(read, beams, config)
-    for n in read.looked_at.tolist():
-        ids = [k for k in read.finished[n].keyframe_ids[::EVERY] if k in read.keyframes]
-        may_fail = round((1.0 - config.share) * len(ids))
-        failed = 0
-        for k in ids:
-            failed += not look.is_shown(k, n, gone)
-            if failed > may_fail:
-                break
-        if failed <= may_fail:
-            gone.append(n)
-    return [read.finished[n] for n in gone]
-
-
-class _Look:
-    """Looks whether submaps show what keyframes saw."""
-
-    def __init__(self, read: _Read, beams: Beams, config: ScanThinningConfig) -> None:
-        self._read, self._beams, self._config = read, beams, config
-        rows = [read.rows(submap.keyframe_ids) for submap in read.finished]
-        self._owner = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-        self._places = read.x[np.concatenate(rows), :2]
-        self._walls: dict[int, Bool] = {}
-
-    def is_shown(self, k: int, before: int, gone: list[int]) -> bool:
-        """Say whether enough submaps before one, but for those that go, show a keyframe's scan."""
-        config, x, scan = self._config, self._read.place(k), self._read.keyframes[k].scan
-        apart = self._places - x[:2]
-        owners = np.unique(self._owner[np.hypot(*apart.T) <= config.near])
-        owners = np.setdiff1d(owners[owners < before], gone)
-        if len(owners) < config.covers or scan is None:
-            return False
-        hits = self._beams.points(scan).hits[::EVERY]
-        hits = hits[np.hypot(*hits.T) < FARTHEST]
-        shown = 0
-        for left, n in zip(range(len(owners), 0, -1), owners.tolist()):
-            shown += self._shows(n, x, hits)
-            if shown >= config.covers or shown + left <= config.covers:
-                break
-        return shown >= config.covers
-
-    def _shows(self, n: int, x: Array, hits: Array) -> bool:
-        """Say whether a submap shows beams (N, 2) that were seen from a place (3,)."""
-        submap = self._read.finished[n]
-        if n not in self._walls:
-            self._walls[n] = beside(is_wall(submap.grid))
-        in_submap = between_planar(self._read.place(submap.anchor_id), x)
-        points = transform_planar(in_submap, hits)
-        if _share(submap.grid, self._walls[n], points) < self._config.on_walls:
-            return False
-        return submap.grid.share_in_free(points) <= self._config.in_free
-
-
-def _share(grid: OccupancyGrid, marked: Bool, points: Array) -> float:
-    """Return the share of points (N, 2) in marked cells of a grid."""
-    x, y = np.floor((points - grid.origin) / grid.resolution).astype(np.int64).T
-    height, width = marked.shape
-    is_in = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    return float(marked[y[is_in], x[is_in]].sum()) / max(len(points), 1)
-
-
-def _plan(read: _Read, gone: list[Submap]) -> _Plan:
+def _plan(read: ScanMap, gone: list[Submap]) -> _Plan:
     """Say which keyframes and edges go with submaps, and what comes in their place."""
     anchors = {submap.anchor_id for submap in gone}
     stay = {k for s in read.finished if s.anchor_id not in anchors for k in s.keyframe_ids}
@@ -290,69 +185,79 @@ def _plan(read: _Read, gone: list[Submap]) -> _Plan:
     is_gone = np.isin(edges.i, ids) | np.isin(edges.j, ids)
     between = np.isin(edges.i, left) & np.isin(edges.j, left)
     renamed = (kinds == SUBMAP) & np.isin(edges.i, list(anchors)) & between
-    folded, within = _folded(read, ids, is_gone, between & ((kinds == FOLDED) | renamed))
-    rows = np.flatnonzero(is_gone | renamed | within)
-    only_renamed = np.flatnonzero(renamed & ~within)
     holders = [_holder(read, k, left) for k in ids.tolist()]
-    new = _joined(_with_kind(edges, only_renamed, FOLDED), folded)
-    return _Plan(ids, np.array(holders, np.int64), rows, new)
+    new = _with_kind(edges, np.flatnonzero(renamed), FOLDED)
+    new = _joined(new, _ties(read, ids, is_gone, between, left))
+    return _Plan(ids, np.array(holders, np.int64), np.flatnonzero(is_gone | renamed), new)
 
 
-def _holder(read: _Read, k: int, left: Index) -> int:
+def _holder(read: ScanMap, k: int, left: Index) -> int:
     """Return the nearest of the older keyframes that are left."""
     older = left[left < k]
     apart = np.linalg.norm(read.x[read.rows(older), :2] - read.place(k)[:2], axis=1)
     return int(older[apart.argmin()])
 
 
-def _folded(read: _Read, ids: Index, is_gone: Bool, may_fold: Bool) -> tuple[EdgeTable, Bool]:
-    """Fold the edges to keyframes that go.
+def _ties(read: ScanMap, ids: Index, is_gone: Bool, between: Bool, left: Index) -> EdgeTable:
+    """Return what ties together what would fall apart without keyframes.
 
     Args:
         read: of the map.
         ids: of these keyframes.
         is_gone: (E,) edges to them.
-        may_fold: (E,) edges between others that may be folded in.
-
-    Returns:
-        The edges in their place, and which (E,) of those between others are folded in.
+        between: (E,) edges between others.
+        left: ids of the others.
     """
     edges = read.edges
     alive = np.isin(edges.i, read.ids) & np.isin(edges.j, read.ids)
-    telling = is_gone & alive & _is_believed(read, is_gone & alive)
-    around = np.setdiff1d(np.r_[edges.i[telling], edges.j[telling]], ids)
-    within = may_fold & np.isin(edges.i, around) & np.isin(edges.j, around)
-    used = np.flatnonzero(telling | within)
-    if not len(used):
-        return _with_kind(edges, used, FOLDED), within
+    believed = _is_believed(read, alive)
+    stay = between & believed & (edges.information[:, 0, 0] > 0.0)
+    parts = connected_components(
+        len(left), np.searchsorted(left, edges.i[stay]), np.searchsorted(left, edges.j[stay])
+    )
+    used = np.flatnonzero(is_gone & alive & believed)
+    around = np.setdiff1d(np.r_[edges.i[used], edges.j[used]], ids)
+    if len(np.unique(parts[np.searchsorted(left, around)])) < 2:
+        return _with_kind(edges, used[:0], FOLDED)
     nodes = np.union1d(around, np.r_[edges.i[used], edges.j[used]])
-    ends = np.searchsorted(nodes, edges.i[used]), np.searchsorted(nodes, edges.j[used])
-    plane = IN_PLANE[:, None], IN_PLANE
     graph = PoseGraph(
         "SE2",
         planar_matrix(read.x[read.rows(nodes)]),
-        *ends,
+        np.searchsorted(nodes, edges.i[used]),
+        np.searchsorted(nodes, edges.j[used]),
         planar_matrix(to_plane(edges.Ts_i_j[used])),
-        edges.information[used][:, *plane],
+        edges.information[used][:, IN_PLANE[:, None], IN_PLANE],
     )
     tree = fold(graph, np.isin(nodes, ids))
+    i, j = nodes[tree.first], nodes[tree.second]
+    ends = np.searchsorted(left, i), np.searchsorted(left, j)
+    chosen = _joining(parts, *ends, np.linalg.slogdet(tree.information)[1])
     x = np.column_stack([
-        tree.Ts_first_second[:, :2, 2],
-        np.arctan2(tree.Ts_first_second[:, 1, 0], tree.Ts_first_second[:, 0, 0]),
+        tree.Ts_first_second[chosen, :2, 2],
+        np.arctan2(tree.Ts_first_second[chosen, 1, 0], tree.Ts_first_second[chosen, 0, 0]),
     ])  # fmt: skip
-    count = len(x)
-    table = EdgeTable(
-        nodes[tree.first],
-        nodes[tree.second],
+    return EdgeTable(
+        i[chosen],
+        j[chosen],
         from_plane(x),
-        np.ones(count),
-        lift_information(tree.information),
-        (FOLDED,) * count,
+        np.ones(len(chosen)),
+        lift_information(tree.information[chosen]),
+        (FOLDED,) * len(chosen),
     )
-    return table, within
 
 
-def _is_believed(read: _Read, chosen: Bool) -> Bool:
+def _joining(parts: Index, i: Index, j: Index, sure: Array) -> Index:
+    """Return the rows of the surest edges that make one of parts (N,) of a graph."""
+    parts, chosen = parts.copy(), []
+    for row in np.argsort(-sure, kind="stable").tolist():
+        a, b = parts[i[row]], parts[j[row]]
+        if a != b:
+            parts[parts == b] = a
+            chosen.append(row)
+    return np.array(chosen, np.int64)
+
+
+def _is_believed(read: ScanMap, chosen: Bool) -> Bool:
     """Say of each edge (E,) whether the path does not contradict it; only loops may be."""
     edges, kinds = read.edges, np.array(read.edges.kind, str)
     rows = np.flatnonzero(chosen & (kinds == LOOP))
