@@ -1,6 +1,7 @@
 """Local mapping as a whole: what it makes of windows of known truth, and of small walks."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -264,14 +265,33 @@ def run(source, config, rhythm="inline", after=lambda slam, estimate: None):
     return slam, slam.finish()
 
 
+@pytest.fixture(scope="module")
+def walked(rounds):
+    """What comes of all four rounds, run once: a system, its result, and the sizes of its map.
+
+    Sizes (N, 2) are numbers of keyframes and landmarks after each frame.
+    """
+
+    @cache
+    def results(sensors, how):
+        sizes = []
+
+        def after(slam, estimate):
+            sizes.append((slam.map.num_keyframes, slam.map.num_landmarks))
+            if estimate.is_keyframe:
+                is_sound(slam.map)
+
+        slam, result = run(rounds, tracker(sensors, how), after=after)
+        return slam, result, np.array(sizes)
+
+    return results
+
+
 @pytest.mark.parametrize("how", ["features", "flow"])
 @pytest.mark.parametrize("sensors", ["stereo", "mono", "rgbd"])
-def test_a_map_is_sound_at_any_time(rounds, sensors, how):
-    def after(slam, estimate):
-        if estimate.is_keyframe:
-            is_sound(slam.map)
-
-    slam, result = run(rounds.part(0, 2 * PER_ROUND), tracker(sensors, how), after=after)
+def test_a_map_is_sound_at_any_time(walked, sensors, how):
+    slam, result, _ = walked(sensors, how)
+    is_sound(slam.map)
     assert slam.worker.failures == []
     assert set(result.mapping) == {
         "landmarks_created",
@@ -382,8 +402,8 @@ def num_unseen(m):
 
 @pytest.mark.parametrize("how", ["features", "flow"])
 @pytest.mark.parametrize("sensors", ["stereo", "mono", "rgbd"])
-def test_a_place_walked_round_again_and_again_does_not_grow_the_map(rounds, sensors, how):
-    sizes, result = sizes_of(rounds, tracker(sensors, how))
+def test_a_place_walked_round_again_and_again_does_not_grow_the_map(walked, rounds, sensors, how):
+    _, result, sizes = walked(sensors, how)
     two, four = sizes[2 * PER_ROUND - 1], sizes[-1]
     assert (four <= 1.3 * two).all(), f"keyframes, landmarks: {two} after 2 rounds, {four} after 4"
     align = "se3" if result.is_metric else "sim3"
@@ -392,7 +412,7 @@ def test_a_place_walked_round_again_and_again_does_not_grow_the_map(rounds, sens
 
 @pytest.mark.parametrize("how", ["features", "flow"])
 @pytest.mark.parametrize("sensors", ["stereo", "mono", "rgbd"])
-def test_every_landmark_is_seen_and_no_keypoint_is_two(rounds, sensors, how):
-    slam, _ = run(rounds.part(0, 2 * PER_ROUND), tracker(sensors, how))
+def test_every_landmark_is_seen_and_no_keypoint_is_two(walked, sensors, how):
+    slam, _, _ = walked(sensors, how)
     assert num_unseen(slam.map) == 0
     assert num_doubled(slam.map) == 0
