@@ -93,6 +93,7 @@ class ScanTracker:
         self._odometry: Array | None = None
         self._step, self._step_s = np.zeros(3), 0.0
         self._since = np.zeros((3, 3))
+        self._unknown = 1.0
         self._keyframe = -1
         self._wanted: ScanView | None = None
         self._made: int | None = None
@@ -137,7 +138,7 @@ class ScanTracker:
         wanted, self._wanted = self._wanted, None
         if wanted is not None and wanted.scan is not None:
             submap = self._submaps.active[0]
-            sure, T = lift_covariance(submap.covariance), from_plane(submap.x_anchor_body)
+            sure, T = lift_covariance(submap.whole_covariance), from_plane(submap.x_anchor_body)
             in_submap = Placed(wanted.frame.stamp_ns, submap.anchor_id, T, sure)
             in_world = self.path.covariance(in_submap)
             last = self.path.last_pose()
@@ -198,6 +199,7 @@ class ScanTracker:
         """Take a pose as found."""
         self._submaps.place(match.x_grid_body, match.information)
         self._since = fused(self._since, match.information)
+        self._unknown = 1.0 - match.on_walls
         if not self._is_mapping and self._submaps.change():
             self._keyframe = self._submaps.active[0].anchor_id
 
@@ -325,6 +327,6 @@ class ScanTracker:
         # In the plane exactly: what corrections round, one on top of the other, would add up.
         T_world_body = from_plane(to_plane(T_world_body))
         self._map.add_keyframe(keyframe, T_world_body, parent=parent, covariance=covariance)
-        self._submaps.add(k, scan)
+        self._submaps.add(k, scan, self._unknown * self._since)
         self._keyframe, self._since = k, np.zeros((3, 3))
         return k

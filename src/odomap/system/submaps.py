@@ -5,6 +5,10 @@ only, over which drift does not show, in the frame of the first of them, its anc
 
     submap s = { anchor a,  x_a_k of its keyframes k,  the grid of their scans there }
 
+Scans are laid onto walls of scans before, and add walls of their own: the share f of them that was
+not known yet is as unsure as the way since the last keyframe, R, and so a submap drifts, too,
+by f R from keyframe to keyframe.
+
 Two are active at a time, the older half full when the younger begins, so that a scan is always
 matched to one that has seen enough; full ones are finished and never change. What is kept in the
 map is an edge of kind "submap" from the anchor to each of its keyframes, where it was when its scan
@@ -55,6 +59,7 @@ class Submap:
         x_anchor_body: (3,) where the body is now, while the submap is active.
         covariance: (3, 3) of that, right tangent.
         x_anchor_keyframe: (3,) its newest keyframe.
+        drift: (3, 3) how unsure its newest walls are in its frame, tangent at the anchor.
     """
 
     anchor_id: int
@@ -63,6 +68,7 @@ class Submap:
     x_anchor_body: Array = field(default_factory=lambda: np.zeros(3))
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     x_anchor_keyframe: Array = field(default_factory=lambda: np.zeros(3))
+    drift: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def insert(self, keyframe_id: int, scan: ScanPoints, x_anchor_body: Array) -> None:
         """Add the scan of a keyframe."""
@@ -72,6 +78,16 @@ class Submap:
         self.grid.insert(points[-1], points[:n], between=points[n:m], free=points[m:-1])
         self.keyframe_ids.append(keyframe_id)
         self.x_anchor_keyframe = x_anchor_body
+
+    def extend(self, covariance: Array) -> None:
+        """Let the newest walls be less sure than those before by (3, 3), tangent at the body."""
+        to_anchor = between_planar(self.x_anchor_body, np.zeros(3))
+        self.drift = self.drift + moved_covariance(covariance, to_anchor)
+
+    @property
+    def whole_covariance(self) -> Array:
+        """(3, 3) of where the body is, relative to the anchor and not to the walls around."""
+        return self.covariance + moved_covariance(self.drift, self.x_anchor_body)
 
     @property
     def middle(self) -> Array:
@@ -102,13 +118,20 @@ class Submaps:
         self.active: list[Submap] = []
         self.finished: list[Submap] = []
 
-    def add(self, keyframe_id: int, scan: ScanPoints) -> None:
-        """Add a keyframe's scan where the active submaps have the body; begin and finish them."""
+    def add(self, keyframe_id: int, scan: ScanPoints, drift: Array) -> None:
+        """Add a keyframe's scan where the active submaps have the body; begin and finish them.
+
+        Args:
+            keyframe_id: the keyframe.
+            scan: its scan.
+            drift: (3, 3) how much less sure walls are that it adds than those before.
+        """
         if not self.active or len(self.active[-1].keyframe_ids) >= self.config.scans // 2:
             self.begin(keyframe_id)
         for submap in self.active:
             submap.insert(keyframe_id, scan, submap.x_anchor_body)
             if submap.anchor_id != keyframe_id:
+                submap.extend(drift)
                 self._tie(submap, keyframe_id)
         if len(self.active[0].keyframe_ids) >= self.config.scans:
             self.finish()
@@ -150,7 +173,7 @@ class Submaps:
     def _tie(self, submap: Submap, keyframe_id: int) -> None:
         """Keep where a keyframe is in a submap. Two submaps say it of one measurement."""
         count = len(self.active)
-        information = np.linalg.inv(submap.covariance) / count
+        information = np.linalg.inv(submap.whole_covariance) / count
         self._map.add_edge(
             submap.anchor_id,
             keyframe_id,
