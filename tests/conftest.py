@@ -45,3 +45,11 @@ def _no_lines_of_progress():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_EVERY_S", float("inf"))
         yield
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """Leave the report empty, where nobody looks: it takes longer than a dozen frames."""
+    from odomap.views import report
+
+    monkeypatch.setattr(report, "render_report", lambda _: "<!doctype html>\n")

@@ -313,6 +313,7 @@ def test_run_of_a_single_camera_says_that_its_scale_is_its_own(cli, tmp_path):
     assert "stereo needs two cameras" in err
 
 
+@pytest.mark.usefixtures("no_report")
 def test_run_without_out_writes_below_runs(cli, recording, tmp_path):
     code, _, _ = cli("run", recording, "--max-frames", "3")
     assert code == 0
@@ -320,6 +321,7 @@ def test_run_without_out_writes_below_runs(cli, recording, tmp_path):
     assert metrics(tmp_path / "runs" / "room")["frames"] == 3
 
 
+@pytest.mark.usefixtures("no_report")
 def test_info_and_eval_of_a_run(cli, recording, tmp_path):
     code, out, _ = cli("info", recording, "--check")
     assert code == 0
@@ -335,6 +337,7 @@ def test_info_and_eval_of_a_run(cli, recording, tmp_path):
     assert {"eval.json", "path.png", "error.png"} <= {p.name for p in (tmp_path / "e").iterdir()}
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_path_without_scale_is_told_how_to_be_judged(cli, recording, tmp_path):
     cli("run", recording, "--out", "a")
     lines = (tmp_path / "a" / "trajectory.tum").read_text().splitlines()[1:]
@@ -449,6 +452,7 @@ def test_baseline_in_millimetres(refused, euroc):
 # ---- bad input: stamps ----
 
 
+@pytest.mark.usefixtures("no_report")
 def test_stamps_out_of_order_and_repeated_are_mended_and_said(cli, euroc):
     table = rows(euroc, "cam0")
     table[4], table[7] = table[7], table[4]
@@ -459,6 +463,7 @@ def test_stamps_out_of_order_and_repeated_are_mended_and_said(cli, euroc):
     assert metrics(Path("o"))["tracked"] == FRAMES
 
 
+@pytest.mark.usefixtures("no_report")
 def test_stamp_that_is_no_number(cli, euroc):
     table = rows(euroc, "cam0")
     table[5][0] = "NaN"
@@ -469,6 +474,7 @@ def test_stamp_that_is_no_number(cli, euroc):
     assert metrics(Path("o"))["skipped"] >= 1
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(("per_second", "unit"), [(1, "s"), (1000, "ms")])
 def test_stamps_in_another_unit_are_recognised(cli, euroc, per_second, unit):
     start = 1_403_636_579_000_000_000
@@ -486,6 +492,7 @@ def test_stamps_in_another_unit_are_recognised(cli, euroc, per_second, unit):
     assert re.search(rf"\b{unit}\b|second", err)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_gap_of_two_seconds_is_said(cli, euroc):
     for camera in ("cam0", "cam1"):
         table = rows(euroc, camera)
@@ -500,6 +507,7 @@ def test_gap_of_two_seconds_is_said(cli, euroc):
 # ---- bad input: pixels ----
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("kind", ["16-bit", "colour"])
 def test_images_of_another_kind_are_taken(cli, euroc, kind):
     import cv2
@@ -530,6 +538,7 @@ def test_ground_truth_that_is_garbage(cli, euroc):
         assert metrics(Path("o"))["ate_rmse_m"] is None
 
 
+@pytest.mark.usefixtures("no_report")
 def test_ground_truth_of_another_time(cli, euroc):
     path = truth_file(euroc)
     lines = path.read_text().splitlines()
@@ -571,6 +580,7 @@ def test_unwritable_output_is_told_before_tracking(refused, recording, monkeypat
     assert f"{out.split('/below')[0]}" in refused("run", recording, "--out", out, code=1)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_full_disk_saves_what_fits_and_says_so(refused, recording, monkeypatch):
     # The disk fills up once the paths are written: everything later is refused by the system.
     import errno

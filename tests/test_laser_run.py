@@ -59,6 +59,7 @@ def test_the_grid_shows_the_walls_where_they_are(run):
     assert "which map_server loads" in report
 
 
+@pytest.mark.usefixtures("no_report")
 def test_the_map_is_localised_in_and_goes_on(run, tmp_path):
     again = "sim:hall?sensors=laser&seed=4&rounds=0.3"
     assert main(["localize", str(run), again, "--out", str(tmp_path / "there"), "--quiet"]) == 0

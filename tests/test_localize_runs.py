@@ -96,6 +96,7 @@ def test_frames_are_placed_in_the_world_of_the_map(recording, config, mapped, tm
     assert apart(read_tum(tmp_path / "trajectory.tum"), result.trajectory) < 1e-6
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_map_goes_on_and_is_saved_as_it_is_then(recording, config, mapped, tmp_path):
     file, path = mapped
     source = open_source(recording)
@@ -114,6 +115,7 @@ def test_a_map_goes_on_and_is_saved_as_it_is_then(recording, config, mapped, tmp
     assert again.metrics["localised"] == 6
 
 
+@pytest.mark.usefixtures("no_report")
 def test_same_input_same_bytes(recording, config, mapped, tmp_path):
     source = Late(open_source(recording), 8)
     for name, rhythm in (("a", "inline"), ("b", "lockstep")):
@@ -123,6 +125,7 @@ def test_same_input_same_bytes(recording, config, mapped, tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_room_that_is_not_in_the_map(config, mapped, tmp_path, capsys):
     world = World.make(kind="room", seed=8, frames=5, rate_hz=12.0, resolution=(400, 250))
     export_euroc(world, tmp_path / "other")
@@ -166,6 +169,7 @@ def test_the_command_line(recording, mapped, tmp_path, monkeypatch, capsys):
     assert main(["localize", *words, "--config", str(folder / "config.yaml")]) == 0
 
 
+@pytest.mark.usefixtures("no_report")
 def test_another_vocabulary_is_said_and_its_words_are_made_anew(
     recording, mapped, tmp_path, capsys
 ):

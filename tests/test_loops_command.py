@@ -129,6 +129,7 @@ def test_nobody_looks_nobody_notes():
 # ---- writing ----
 
 
+@pytest.mark.usefixtures("no_report")
 def test_where_nothing_was_a_candidate_the_list_is_empty(world, tmp_path):
     found = run(world, tmp_path, config=ENABLED)
     assert "loops.json" in found.written
@@ -138,6 +139,7 @@ def test_where_nothing_was_a_candidate_the_list_is_empty(world, tmp_path):
     assert (m["loops"], m["loops_closed"], m["loops_rejected"]) == (0, 0, 0)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_where_nobody_looks_there_is_no_list_and_none_of_a_run_before(world, tmp_path, cli):
     closed = override(preset("stereo"), [("closing.enabled", "false")])
     for how in ({"config": closed}, {"odometry_only": True}):
@@ -152,6 +154,7 @@ def test_where_nobody_looks_there_is_no_list_and_none_of_a_run_before(world, tmp
     assert "--closing.enabled false" in err
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("rhythm", ["inline", "lockstep"])
 def test_what_is_decided_is_written_with_its_frames(deciding, world, tmp_path, rhythm):
     found = run(world, tmp_path, config=ENABLED, rhythm=rhythm)
@@ -167,6 +170,7 @@ def test_what_is_decided_is_written_with_its_frames(deciding, world, tmp_path, r
     assert (m["loops"], m["loops_closed"], m["loops_rejected"]) == (0, 1, 1)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_an_interrupted_run_has_its_list(deciding, world, tmp_path):
     import signal
 
@@ -303,6 +307,7 @@ def test_no_such_folder_and_a_file_are_told_apart(tmp_path, cli):
     assert "RUN is missing" in cli("loops")[2]
 
 
+@pytest.mark.usefixtures("no_report")
 def test_the_face_runs_it_too(deciding, world, tmp_path):
     assert odomap.run(world, tmp_path, config=ENABLED).metrics["loops_rejected"] == 1
 

@@ -122,6 +122,7 @@ def test_interrupt_ends_after_the_frame_at_hand_and_writes(world, tmp_path):
     assert (tmp_path / "report.html").exists()
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("rhythm", ["inline", "lockstep", "live"])
 def test_interrupt_leaves_what_there_is_in_every_rhythm(world, tmp_path, rhythm):
     before = set(threading.enumerate())
@@ -139,6 +140,7 @@ PARTS = ("reads", "solves", "writes")
 SAME = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap")
 
 
+@pytest.mark.usefixtures("no_report")
 def test_lockstep_is_the_default_and_writes_the_same_bytes_again(result, tmp_path):
     """Also of a world that is rendered anew."""
     assert result.metrics["rhythm"] == "lockstep"
@@ -155,6 +157,7 @@ def test_lockstep_is_the_default_and_writes_the_same_bytes_again(result, tmp_pat
     assert "Beside the frames" in (result.out / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("no_report")
 def test_with_a_delay_of_one_lockstep_writes_the_bytes_of_inline(world, tmp_path):
     config = chosen_config("stereo", None, [("threads.mapping_delay", "1")])
     for rhythm in ("inline", "lockstep"):
@@ -165,6 +168,7 @@ def test_with_a_delay_of_one_lockstep_writes_the_bytes_of_inline(world, tmp_path
         assert inline.read_bytes() == lockstep.read_bytes()
 
 
+@pytest.mark.usefixtures("no_report")
 def test_live_counts_the_frames_that_it_drops(world, tmp_path):
     def slow(progress):
         if progress.stage == "tracking" and progress.done == 2:
@@ -190,6 +194,7 @@ def test_runs_in_a_thread_without_touching_signals(world):
     assert found[0].metrics["frames"] == 2
 
 
+@pytest.mark.usefixtures("no_report")
 def test_skipped_frames_are_counted_and_named(world, tmp_path):
     source = Edited(world, lambda frame: None if frame.id == 4 else frame)
     result = run(source, tmp_path)
@@ -339,6 +344,7 @@ def test_keyframes_have_a_file_of_their_own(lone, result):
         np.testing.assert_allclose(path.positions[rows], keyframes.positions, atol=1e-9)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_the_config_of_a_single_camera_repeats_its_run(lone, tmp_path):
     result, source = lone
     again = run(source, tmp_path, config=result.out / "config.yaml")

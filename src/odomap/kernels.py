@@ -10,6 +10,7 @@ With the environment variable ODOMAP_PLAIN=1 kernels are plain Python: slow, but
 through them.
 """
 
+import functools
 import importlib
 import os
 import sys
@@ -72,11 +73,16 @@ def kernel(function: F | None = None, *, reorder: bool = False) -> F | Callable[
 
 def modules_with_kernels() -> list[str]:
     """Return the dotted names of all modules of the package that define `warm_up`, in order."""
+    return list(_with_kernels())
+
+
+@functools.cache
+def _with_kernels() -> tuple[str, ...]:
     names = []
     for file in sorted(_PACKAGE.rglob("*.py")):
         if file != Path(__file__) and "\ndef warm_up(" in file.read_text(encoding="utf-8"):
             names.append(".".join(("odomap", *file.relative_to(_PACKAGE).with_suffix("").parts)))
-    return names
+    return tuple(names)
 
 
 def needed_modules() -> list[str]:

@@ -11,6 +11,7 @@ import ast
 import contextlib
 import dataclasses
 import enum
+import functools
 import inspect
 import itertools
 import math
@@ -51,6 +52,11 @@ def field_docs(section: type) -> dict[str, str]:
     Returns:
         Field name → text; fields without a docstring are absent.
     """
+    return dict(_field_docs(section))
+
+
+@functools.cache
+def _field_docs(section: type) -> Mapping[str, str]:
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(section)))
     except (OSError, TypeError):

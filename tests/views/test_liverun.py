@@ -68,6 +68,7 @@ def test_a_run_is_told_of_what_is_missing_before_it_begins(monkeypatch, tmp_path
     assert main(["run", WORLD, "--view"]) == 2
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("rhythm", ["inline", "lockstep"])
 def test_watched_or_not_the_files_are_the_same_bytes(viser, plain, tmp_path, view, rhythm, world):
     """With a page that stays, and others that come and go all the time."""
