@@ -44,7 +44,7 @@ LINE = 0.02
 """Standard deviation of a point across the line through the mean of a cell, metres."""
 OFF_LINE = 3.0
 """How many of these off it counts half: it may be of another surface."""
-IN_COMMON_LINES = 0.06, 0.0007
+IN_COMMON_LINES = 0.05, 0.0006
 """What all points of a scan are off by together then: in cells, in radians."""
 NOTHING = np.float32(0.0)
 NORMAL = 0.05
