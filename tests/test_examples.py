@@ -117,7 +117,7 @@ def test_own_camera(capsys):
 def test_solution_of_exercise_1(tmp_path):
     picture = tmp_path / "path.png"
     percent = main_of("exercise_1_solution.py")(
-        "sim:room?seed=4&frames=60&sensors=mono", str(picture)
+        "sim:room?seed=4&frames=60&sensors=mono&resolution=400x250", str(picture)
     )
     assert percent < 1.0
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -125,8 +125,9 @@ def test_solution_of_exercise_1(tmp_path):
 
 def test_solution_of_exercise_2(tmp_path):
     picture = tmp_path / "places.png"
-    training = "sim:room?seed=11&frames=20&sensors=mono&speed=16"
-    recalls = main_of("exercise_2_solution.py")(training=training, picture=str(picture))
+    recording = "sim:room?seed=4&frames=74&sensors=mono&speed=8&resolution=480x300"
+    training = "sim:room?seed=11&frames=20&sensors=mono&speed=16&resolution=480x300"
+    recalls = main_of("exercise_2_solution.py")(recording, training, str(picture))
     assert recalls["10^2"] < 0.5 < recalls["10^4"]
     assert picture.read_bytes().startswith(b"\x89PNG")
 
@@ -154,7 +155,7 @@ def test_solution_of_exercise_4(tmp_path):
 
 def test_solution_of_exercise_5(tmp_path):
     picture = tmp_path / "loop.png"
-    recording = "sim:room?seed=4&frames=52&sensors=mono,depth&speed=6"
+    recording = "sim:room?seed=4&frames=52&sensors=mono,depth&speed=6&resolution=400x250"
     errors = main_of("exercise_5_solution.py")(recording, str(picture))
     assert errors["loops"] < 0.5 * errors["odometry"]
     assert errors["and a false one"] > 10 * errors["odometry"]
