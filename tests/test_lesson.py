@@ -326,7 +326,7 @@ def test_loops_make_walls_single():
     results = ran("36_laser_slam.py")[0]
     (ate_without, walls_without), (ate_with, walls_with) = results.values()
     assert ate_with < 0.8 * ate_without
-    assert walls_with > walls_without + 0.2
+    assert walls_with > walls_without + 0.1
 
 
 def test_bounds_spare_nearly_all_poses():
