@@ -41,7 +41,7 @@ def test_k_nearest_are_those_of_brute_force(kind, k):
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 1 << 20), size=st.floats(0.05, 20.0), limit=st.floats(0.01, 30.0))
+@given(seed=st.integers(0, 1 << 20), size=st.floats(0.3, 20.0), limit=st.floats(0.01, 30.0))
 def test_nearest_within_reach_whatever_the_cells(seed, size, limit):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-8, 8, (80, 3)) * [1, 1, rng.integers(0, 2)]
