@@ -32,6 +32,8 @@ FOCAL_PER_SIZE = (0.1, 30.0)
 FISHEYE_FOCAL_PER_SIZE = (0.03, 30.0)
 """The same for other lenses: a fisheye's picture may be a circle in a wide image, and a double
 sphere's focal length is that of the lens times 1 + xi."""
+MOST_VIEW = 2.0 * np.pi + 0.2
+"""Most that a 2D laser sees, radians: some say that their last beam is the first again."""
 CENTRE_PER_HALF = (0.62, 1.6)
 """A principal point is near the centre; one that is off by more, in both axes and to the same side,
 belongs to an image of another size."""
@@ -122,6 +124,17 @@ class LidarMount:
         if not 0 <= near < far:
             raise CalibrationError(
                 f"lidar '{self.name}': range_m [{near}, {far}] must be [nearest, farthest]"
+            )
+        first, last, beams = self.angles
+        if not (np.isfinite([first, last]).all() and beams >= 0):
+            raise CalibrationError(
+                f"lidar '{self.name}': angles [{first}, {last}, {beams}] must be first, last, and "
+                "how many beams"
+            )
+        if abs(last - first) > MOST_VIEW:
+            raise CalibrationError(
+                f"lidar '{self.name}': angles from {first:g} to {last:g} are more than a turn: "
+                "give them in radians"
             )
 
 
