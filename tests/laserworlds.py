@@ -3,7 +3,8 @@
 import numpy as np
 
 from lidar.rooms import ROOM, cast
-from odomap.geometry.planar import between_planar, compose_planar, from_plane
+from odomap.geometry.lie import se3_inverse
+from odomap.geometry.planar import between_planar, compose_planar, from_plane, to_plane
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import LidarMount, Rig
 
@@ -38,3 +39,24 @@ def frames(path, seed=0, walls=ROOM, odometry=True, sigma=0.01):
 def in_first(path):
     """Return (N, 3) poses as seen from the first."""
     return np.array([between_planar(path[0], x) for x in path])
+
+
+def carried(source, *parts, odometry=True, dark=0):
+    """Return frames of a source in parts (ranges), as if the body was carried from one to the next.
+
+    Wheels do not turn while it is carried, and the laser sees nothing for some scans. Beside them,
+    (N, 3) true poses.
+    """
+    made, true, wheels = [], [], np.eye(4)
+    for part in parts:
+        for n, k in enumerate(part):
+            frame = source.frame(k)
+            if n:
+                wheels = wheels @ se3_inverse(source.odometry[part[n - 1]]) @ source.odometry[k]
+            told = wheels if odometry else None
+            stamp_ns = 100_000_000 * (len(made) + 1)
+            is_dark = part is not parts[0] and n < dark
+            scan = np.full_like(frame.scan, np.nan) if is_dark else frame.scan
+            made.append(Frame(len(made), stamp_ns, scan=scan, odometry=told))
+            true.append(to_plane(source.truth.Ts_world_body[k]))
+    return made, np.array(true)

@@ -143,7 +143,7 @@ def test_only_what_would_fall_apart_is_tied(is_tied):
         lift_information(np.tile(np.diag([4.0, 4.0, 9.0]), (count, 1, 1))),
         (SUBMAP, SUBMAP, LOOP, FOLDED)[:count],
     )
-    read = ScanMap((), np.zeros(0, np.int64), set(), np.arange(4), x, {}, edges)
+    read = ScanMap((), np.zeros(0, np.int64), set(), np.arange(4), x, {}, edges, np.zeros(4))
     ids, left = np.array([1, 2]), np.array([0, 3])
     is_gone = np.isin(i, ids) | np.isin(j, ids)
     tied = _ties(read, ids, is_gone, ~is_gone, left)

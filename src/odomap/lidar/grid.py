@@ -36,6 +36,10 @@ MARGIN = 64
 """Cells by which a grid grows beyond what it must hold."""
 TINY = 1e-6
 """Log-odds of a cell for which as much speaks as against it: it is known, and 0 means unknown."""
+AGAINST = 90
+"""Beams that are followed to say whether they contradict a grid."""
+BEHIND = 0.5
+"""How far behind a wall a beam must end to have gone through it, metres."""
 MOST_CELLS = 400_000_000
 """Cells that a grid may have: beyond, a range or a pose must be wrong."""
 
@@ -183,6 +187,19 @@ class OccupancyGrid:
         in_free = (self.log_odds[y, x] < 0.0) & (around.max(axis=(1, 2), initial=-1.0) <= 0.0)
         return float(in_free.sum()) / max(len(points), 1)
 
+    def share_against(self, sensor: Array, points: Array) -> float:
+        """Return the share of beams that cannot be if this is where they were sent from.
+
+        Args:
+            sensor: (2,) where the scanner is.
+            points: (N, 2) where beams came back from: in the open, or from behind a wall.
+        """
+        some = points[:: max(1, len(points) // AGAINST)]
+        cells = 1.0 / self.resolution
+        start, ends = (sensor - self.origin) * cells, (some - self.origin) * cells
+        count = count_against(self.log_odds, start, ends, self.evidence.hit, BEHIND * cells)
+        return count / max(len(some), 1)
+
     def centres(self, cells: NDArray[np.int64]) -> Array:
         """Return the middles (N, 2), metres, of (N, 2) cells, row and column."""
         return np.asarray(self.origin + (cells[:, ::-1] + 0.5) * self.resolution)
@@ -257,6 +274,32 @@ def _moved(cells: NDArray[C], before: NDArray[np.int64], size: NDArray[np.int64]
     if cells.size:
         larger[before[1] : before[1] + height, before[0] : before[0] + width] = cells
     return larger
+
+
+@kernel
+def count_against(log_odds: Cells, start: Array, ends: Array, hit: float, behind: float) -> int:
+    """Points that are in the open, or on the way to which, further before than `behind`, is a cell
+    that more than one hit speaks for."""
+    height, width = log_odds.shape
+    count = 0
+    for i in range(len(ends)):
+        d_x, d_y = ends[i, 0] - start[0], ends[i, 1] - start[1]
+        length = np.hypot(d_x, d_y)
+        x, y = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
+        is_against = False
+        if x > 0 and y > 0 and x < width - 1 and y < height - 1:
+            is_against = log_odds[y, x] < 0.0
+            for n in range(9):
+                is_against = is_against and log_odds[y - 1 + n // 3, x - 1 + n % 3] <= 0.0
+        for step in range(1, int(length - behind) + 1):
+            if is_against:
+                break
+            x = int(np.floor(start[0] + step / length * d_x))
+            y = int(np.floor(start[1] + step / length * d_y))
+            if x >= 0 and y >= 0 and x < width and y < height:
+                is_against = log_odds[y, x] > hit
+        count += is_against
+    return count
 
 
 @kernel
@@ -339,3 +382,4 @@ def warm_up() -> None:
     """Compile the kernels of this module."""
     grid = OccupancyGrid(0.1, keeps_hits=True)
     grid.insert(np.zeros(2), np.array([[0.35, 0.1]]))
+    grid.share_against(np.zeros(2), np.array([[0.35, 0.1]]))

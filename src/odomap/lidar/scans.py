@@ -71,10 +71,14 @@ class Beams:
     Args:
         mount: of a 2D scanner.
         config: what is used.
+
+    Attributes:
+        mount: of the scanner.
+        config: what is used.
     """
 
     def __init__(self, mount: LidarMount, config: ScanConfig | None = None) -> None:
-        self.config = ScanConfig() if config is None else config
+        self.mount, self.config = mount, ScanConfig() if config is None else config
         first, last, count = mount.angles
         angles = np.linspace(first, last, count)
         T = mount.T_body_lidar.matrix
@@ -125,6 +129,10 @@ class Beams:
             num_beams=len(ranges),
             num_invalid=int(np.count_nonzero(np.isnan(ranges))),
         )
+
+    def nothing(self) -> ScanPoints:
+        """Return a scan that says nothing."""
+        return self.points(np.full(len(self), np.nan))
 
     def _free(self, ranges: Array) -> Array:
         """Return how far the way is free (F, 2) where nothing came back."""

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from odomap.maps.columns import grown
 
-__all__ = ["FOLDED", "GAP", "LOOP", "EdgeTable", "Edges"]
+__all__ = ["FOLDED", "GAP", "LOOP", "ODOMETRY", "EdgeTable", "Edges"]
 
 LOOP = "loop"
 """Kind of the edges that say where two keyframes of one place lie to each other."""
 GAP = "gap"
 """Kind of the edges that say where nothing is known of that: a piece begins (`atlas`)."""
+ODOMETRY = "odometry"
+"""Kind of the edges that only the wheels say something of."""
 FOLDED = "folded"
 """Kind of the edges that say what others said, to keyframes that were culled."""
 

@@ -1,6 +1,6 @@
 """SLAM with a 2D laser, with or without the odometry of wheels.
 
-    scan → ScanTracker → estimate;   keyframes → Submaps;   keyframe → ScanCloser → path corrected
+    scan → ScanTracker → estimate;   keyframes → Submaps;   keyframe → ScanJoiner → path corrected
 
 The tracker lays every scan onto a submap of the last keyframes (`scantracking`, `submaps`), the
 closer searches for keyframes in the submaps of earlier and solves the graph of all (`scanclosing`).
@@ -75,13 +75,15 @@ class LaserSlam(System):
         if not self._config.scan_closing.enabled:
             return None
         from odomap.system.scanclosing import ScanCloser  # what compiles pose graphs
+        from odomap.system.scanjoining import ScanJoiner
         from odomap.system.scanthinning import ScanThinner
 
         parts, config = (self.map, self._beams, self.submaps), self._config
         closer = ScanCloser(*parts, config.scan_closing)
+        joiner = ScanJoiner(*parts, config.scan_tracking, closer)
         if not config.scan_thinning.enabled:
-            return closer
-        return ScanThinner(closer, *parts, config.scan_thinning)
+            return joiner
+        return ScanThinner(joiner, *parts, config.scan_thinning)
 
     @property
     def _path(self) -> Path:

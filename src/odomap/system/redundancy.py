@@ -46,6 +46,7 @@ class ScanMap:
         x: (K, 3) where they are.
         keyframes: by id.
         edges: all there are.
+        pieces: (K,) of the map that they are in.
     """
 
     finished: tuple[Submap, ...]
@@ -55,6 +56,7 @@ class ScanMap:
     x: Array
     keyframes: dict[int, Keyframe]
     edges: EdgeTable
+    pieces: Index
 
     def place(self, k: int) -> Array:
         """Return where (3,) a living keyframe is."""
@@ -97,13 +99,16 @@ class _Look:
         rows = [read.rows(submap.keyframe_ids) for submap in read.finished]
         self._owner = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
         self._places = read.x[np.concatenate(rows), :2]
+        self._pieces = read.pieces[np.concatenate(rows)]
         self._walls: dict[int, Bool] = {}
 
     def is_shown(self, k: int, before: int, gone: list[int]) -> bool:
         """Say whether enough submaps before one, but for those that go, show a keyframe's scan."""
         config, x, scan = self._config, self._read.place(k), self._read.keyframes[k].scan
         apart = self._places - x[:2]
-        owners = np.unique(self._owner[np.hypot(*apart.T) <= config.near])
+        is_near = np.hypot(*apart.T) <= config.near
+        is_near &= self._pieces == self._read.pieces[self._read.rows([k])]
+        owners = np.unique(self._owner[is_near])
         owners = np.setdiff1d(owners[owners < before], gone)
         if len(owners) < config.covers or scan is None:
             return False

@@ -117,6 +117,11 @@ class ScanCloser:
         """Read the graph at the end of a run, if it was not solved since the last loop."""
         return self._job(None, (), self._num_loops > 0, True)
 
+    def expect(self) -> None:
+        """Take notice of a loop that somebody else closed: the path is to be solved."""
+        self._pending += 1
+        self._num_loops += 1
+
     def _is_due(self) -> bool:
         least = max(self._config.solve_every, self._config.solve_share * self._map.num_keyframes)
         return self._pending > 0 and self._since_solved >= least
@@ -148,6 +153,8 @@ class ScanCloser:
             submap = finished[index]
             if k - self._tied.get(submap.anchor_id, -config.apart) < config.apart:
                 continue
+            if self._submaps.piece_of(submap) != self._submaps.pieces.of(k):
+                continue  # where it is from there nobody knows
             if submap.keyframe_ids[-1] > k - self._submaps.config.scans // 2:
                 continue  # what is tied to it by submaps already
             x_anchor, anchor_sure = self._pose(submap.anchor_id)

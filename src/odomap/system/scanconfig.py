@@ -55,7 +55,8 @@ class ScanTrackingConfig:
     slip_rad: Positive = 0.4
     """The same of the heading, radians."""
     few_on_walls: Fraction = 0.5
-    """Share of beams on walls of the submap below which odometry is doubted."""
+    """Share of beams on walls of the submap below which odometry is doubted, and not as many may
+    contradict the map: end in the open, or behind walls."""
     min_hits: Count = 20
     """Beams that must come back for a scan to say anything."""
     min_on_walls: Fraction = 0.25
@@ -64,12 +65,34 @@ class ScanTrackingConfig:
     """Way after which a scan becomes a keyframe, metres."""
     keyframe_rad: Positive = 0.1
     """Turn after which it does, radians."""
+    checks_mount: bool = True
+    """Whether the motion that the laser sees is compared with the wheels' in the beginning."""
+    doubtful: Fraction = 0.12
+    """Share of the beams that contradict the map, relative to those and those on walls, above
+    which, scan after scan, it is searched for a place that fits better."""
+    patience: Count = 5
+    """Scans in a row that show nothing known after which new ground is mapped by odometry, or else,
+    where they contradict the map, the body is lost."""
     lost_reach: Positive = 2.0
     """How far around the last place a lost body is searched for, metres."""
+    lost_score: Fraction = 0.5
+    """Share of the beams that must meet walls there."""
+    lost_submaps: Count = 2
+    """Submaps that each scan of a lost body is searched for in."""
+    lost_scans: Count = 30
+    """Scans of a lost body after which a new piece of the map begins."""
+    lost_m: NotNegative = 1.0
+    """Way by odometry since then that it takes as well, where there is odometry, metres."""
     known_score: Fraction = 0.6
-    """Share of the beams that must meet walls for a first scan to be recognised in a map."""
+    """Share of the beams that must meet walls for a scan to be recognised in a map."""
     known_in_free: Fraction = 0.1
-    """Share of those that may end in the open, relative to those that meet walls or do so."""
+    """Share of those that may contradict the map: end in the open, or behind walls."""
+    known_on_walls: Fraction = 0.8
+    """Share of them that must lie on walls when it has been matched."""
+    known_scans: Count = 15
+    """Scans for which that must stay so before the body is believed to be there."""
+    known_sigma: Positive = 0.2
+    """Largest standard deviation of a place that is recognised, metres."""
 
     def __post_init__(self) -> None:
         check_limits(self)

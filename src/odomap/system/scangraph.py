@@ -27,13 +27,14 @@ from odomap.backend.graphs.gnc import find_inliers
 from odomap.backend.graphs.solve import solve
 from odomap.geometry.planar import (
     IN_PLANE,
+    between_planar,
     from_plane,
     lift_covariance,
     planar_matrix,
     to_plane,
 )
 from odomap.geometry.robust import Loss
-from odomap.maps.edges import FOLDED, LOOP
+from odomap.maps.edges import FOLDED, GAP, LOOP, ODOMETRY
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot
 from odomap.system.essentialgraph import EssentialGraph
@@ -46,6 +47,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Pair = tuple[int, int]
 
+UNKNOWN = np.diag([1e-4, 1e-4, 0.1])
+"""Information of the step from one piece of the map to the next: it keeps the graph in one."""
 STEPS = 10
 """Steps of a solution at most; the path as it is is near."""
 
@@ -150,14 +153,19 @@ def read_graph(map: Map, false: Set[Pair]) -> ScanGraph:
         edges = map.edges()
     kinds = np.array(edges.kind, str)
     alive = np.isin(edges.i, snapshot.keyframe_ids) & np.isin(edges.j, snapshot.keyframe_ids)
-    used = np.flatnonzero(alive & np.isin(kinds, (SUBMAP, FOLDED, LOOP)))
+    used = np.flatnonzero(alive & np.isin(kinds, (SUBMAP, FOLDED, LOOP, ODOMETRY, GAP)))
+    x, information = to_plane(edges.Ts_i_j[used]), edges.information[used]
+    information = information[:, IN_PLANE[:, None], IN_PLANE]
+    for row in np.flatnonzero(kinds[used] == GAP):  # which draws nothing to where it was
+        i, j = (to_plane(map.T_world_body(int(each[used[row]]))) for each in (edges.i, edges.j))
+        x[row], information[row] = between_planar(i, j), UNKNOWN
     ends = zip(edges.j[used].tolist(), edges.i[used].tolist(), strict=True)
     return ScanGraph(
         snapshot,
         edges.i[used],
         edges.j[used],
-        to_plane(edges.Ts_i_j[used]),
-        edges.information[used][:, IN_PLANE[:, None], IN_PLANE],
+        x,
+        information,
         kinds[used] == LOOP,
         np.array([pair in false for pair in ends], bool),
     )

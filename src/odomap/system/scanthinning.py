@@ -104,7 +104,8 @@ class ScanThinner:
         held = {k for submap in active for k in submap.keyframe_ids}
         gaps = np.flatnonzero(np.array(edges.kind, str) == GAP)
         held |= {int(ids[0]), *edges.i[gaps].tolist(), *edges.j[gaps].tolist()}
-        return ScanMap(finished, np.union1d(new, others), held, ids, x, keyframes, edges)
+        pieces = np.array([self._submaps.pieces.of(k) for k in ids.tolist()], np.int64)
+        return ScanMap(finished, np.union1d(new, others), held, ids, x, keyframes, edges, pieces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +195,7 @@ def _plan(read: ScanMap, gone: list[Submap]) -> _Plan:
 def _holder(read: ScanMap, k: int, left: Index) -> int:
     """Return the nearest of the older keyframes that are left."""
     older = left[left < k]
+    older = older[read.pieces[read.rows(older)] == read.pieces[read.rows([k])]]
     apart = np.linalg.norm(read.x[read.rows(older), :2] - read.place(k)[:2], axis=1)
     return int(older[apart.argmin()])
 

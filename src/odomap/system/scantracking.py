@@ -9,18 +9,21 @@ the covariance grows:
     x, P = argmin |1 - m(T_x p)|²/σ² + |x - x̂|²_P̂, (P̂⁻¹ + Λ)⁻¹
 
 When the body has moved far enough the scan becomes a keyframe, and part of the submaps. A scan that
-says nothing, or does not fit, is passed over: with odometry the path goes on by that alone, without
-it the body is lost, and searched for in a wide window until a scan fits.
+says nothing is passed over: with odometry the path goes on by that alone. One that shows something
+else than it should (`scanjudging`) is searched for around, and
+
+    on new ground, with odometry      is mapped where that says
+    where it contradicts the map      is searched for everywhere (`scanrecognition`)
+    found nowhere for long            begins a piece of its own, to be joined when it is recognised
 
 Reference: W. Hess, D. Kohler, H. Rapp, D. Andor, "Real-time loop closure in 2D LIDAR SLAM", ICRA
-2016; S. Thrun, W. Burgard, D. Fox, "Probabilistic robotics", MIT Press 2005, chapter 5 (odometry).
+2016.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.errors import CalibrationError
 from odomap.geometry.planar import (
     between_planar,
     from_plane,
@@ -30,39 +33,30 @@ from odomap.geometry.planar import (
     to_plane,
 )
 from odomap.geometry.pose import SE3
-from odomap.lidar.branchbound import GridPyramid
-from odomap.lidar.correlative import search_near
 from odomap.lidar.fusion import fused
-from odomap.lidar.gridmatching import GridMatch, lay_on_grid
+from odomap.lidar.gridmatching import GridMatch
 from odomap.lidar.scans import Beams, ScanPoints
-from odomap.maps.edges import LOOP
+from odomap.maps.edges import LOOP, ODOMETRY
 from odomap.maps.estimate import Estimate, Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
-from odomap.system.looking import Clock
+from odomap.system.mountcheck import MountCheck
 from odomap.system.path import Path, Placed
 from odomap.system.scanconfig import ScanTrackingConfig
-from odomap.system.scanrecognition import recognise_scan
+from odomap.system.scanjudging import Judgement, ScanJudge
+from odomap.system.scanmotion import Loss, ScanMotion
+from odomap.system.scanrecognition import ScanFinder
+from odomap.system.scantrial import ScanTrial
+from odomap.system.scanview import ScanView, view_scan
 from odomap.system.submaps import Submap, Submaps
 
 __all__ = ["ScanTracker"]
 
 Array = NDArray[np.float64]
 
-SURPRISE = 9.0
-"""Squared standard deviations off odometry from which on it is asked whether that is true."""
-MORE_ON_WALLS = 0.05
-"""Share of the beams that must meet walls elsewhere, and not where odometry leads."""
-
-
-@dataclass(frozen=True, eq=False)
-class ScanView:
-    """A scan being tracked: its points, and the clock."""
-
-    frame: Frame
-    scan: ScanPoints | None
-    clock: Clock
+ANEW = "started anew where it was last: how it moved since is not known"
+FOUND = "found again in the map"
 
 
 class ScanTracker:
@@ -90,48 +84,63 @@ class ScanTracker:
         self._map, self._beams, self._submaps, self._config = map, beams, submaps, config
         self._is_mapping = is_mapping
         self.path = Path(map)
-        self._odometry: Array | None = None
-        self._step, self._step_s = np.zeros(3), 0.0
         self._since = np.zeros((3, 3))
         self._unknown = 1.0
         self._keyframe = -1
         self._wanted: ScanView | None = None
+        self._before: ScanView | None = None
         self._made: int | None = None
-        self._stamp_ns = 0
         self._is_lost = False
+        self._blind = 0
+        self._motion, self._loss = ScanMotion(config), Loss()
+        self._finder = ScanFinder(map, submaps.pieces, config)
+        self._judge = ScanJudge(config, self._finder)
+        self._trial = ScanTrial(submaps, self._judge, config)
+        self._mount_check = MountCheck(beams.mount, config)
 
     def prepare(self, frame: Frame) -> ScanView:
         """Make points of a scan, without looking at the map."""
-        clock = Clock()
-        scan = None if frame.scan is None else self._beams.points(frame.scan)
-        clock.lap("points")
-        return ScanView(frame, scan, clock)
+        return view_scan(frame, self._beams)
 
     def track(self, view: ScanView) -> Estimate:
-        """Place a scan."""
+        """Place a scan.
+
+        Raises:
+            CalibrationError: what the laser sees cannot be what the rig says.
+        """
         view.clock.resume()
         self._made = None
-        reason = self._says_nothing(view)
+        reason = view.says_nothing(self._config.min_hits)
+        scan = None if reason else view.scan
         if self._keyframe < 0:
             return self._begin(view, reason)
-        motion, noise, is_known = self._motion(view.frame)
-        self._submaps.move(motion, noise)
-        self._since = moved_covariance(self._since, motion) + noise
-        match = None
-        if not reason and view.scan is not None:
-            match = self._match(view.scan, is_known)
-            if match.on_walls < self._config.min_on_walls:
-                shown = f"{match.on_walls:.0%} of {len(view.scan)} beams"
-                reason = f"only {shown} meet walls that are known"
-                match = None
+        motion = self._motion.until(view.frame)
+        self._mount_check.check(view.scan, self._motion.x_odom_body)
+        self._submaps.move(motion.x, motion.noise)
+        self._since = moved_covariance(self._since, motion.x) + motion.noise
+        if scan is not None and motion.has_moved and view.is_like(self._before):
+            scan, reason = None, "the scan is the one before, bit by bit: frozen?"
+        self._before = view
+        if scan is None:
+            view.clock.lap("track")
+            return self._go_blind(view, reason, motion.is_measured)
+        said = Judgement(None, "what is seen is not known here")
+        if self._trial.submap is not None:
+            return self._watch(view, scan, motion.is_measured)
+        if not self._is_lost:
+            said = self._judge.match(self._submaps.active[0], scan, motion.is_measured)
         view.clock.lap("track")
-        if match is not None:
-            self._accept(match)
-        elif not is_known:
-            return self._lose(view, reason)
-        else:
-            reason = f"{reason}: followed by odometry alone"
-        return self._estimate(view, match, reason)
+        if said.match is None or (said.is_doubtful and self._loss.scans):
+            self._loss.add(motion, self._judge.was_clean)
+            return self._seek(view, scan, said.reason, motion.is_measured)
+        elsewhere = self._judge.elsewhere(self._places(), self._submaps.active[0], scan, said)
+        if elsewhere is not None:
+            return self._return(view, *elsewhere)
+        if said.doubted is not None:  # odometry was wrong, by that much
+            self._submaps.move(np.zeros(3), said.doubted)
+            self._since = self._since + said.doubted
+        self._accept(said.match)
+        return self._estimate(view, said.match, "")
 
     def make_keyframe(self) -> Keyframe | None:
         """Make the last scan a keyframe if it is to be one, and return it; else None."""
@@ -152,31 +161,148 @@ class ScanTracker:
 
     def _begin(self, view: ScanView, reason: str) -> Estimate:
         """Begin a map with a scan that shows something, or find it in the map that there is."""
-        frame, scan, config = view.frame, view.scan, self._config
+        frame, scan, finished = view.frame, view.scan, self._submaps.finished
+        if view.wrong and frame.scan is not None and frame.scan.size:
+            raise CalibrationError(f"{view.wrong}: mend its angles in a rig.yaml")
+        self._blind += 1
+        is_told = self._is_mapping and not finished and self._motion.read(frame) is not None
+        if reason and is_told and self._blind > self._config.patience:
+            scan, reason = self._beams.nothing(), ""  # the wheels say where the body goes
+        if reason or scan is None:
+            return self._wait(view, reason)
         found = None
-        if not reason and scan is not None and self._submaps.finished:
-            score, in_free = config.known_score, config.known_in_free
-            found = recognise_scan(self._submaps.finished, scan, score, in_free)
-            reason = f"not recognised: {found}" if isinstance(found, str) else ""
-        view.clock.lap("track")
-        if reason or scan is None or isinstance(found, str):
-            identity = SE3.identity()
-            return Estimate(
-                frame.id, frame.stamp_ns, Status.INITIALIZING, reason, -1, identity, identity,
-                np.zeros((6, 6)), timing=view.clock.laps,
-            )  # fmt: skip
-        self._stamp_ns, self._odometry = frame.stamp_ns, self._read_odometry(frame)
+        if finished:
+            most = self._config.lost_submaps if self._blind > 1 else None
+            found = self._finder.anywhere(finished, scan, most)
+            view.clock.lap("track")
+            if isinstance(found, str):
+                return self._wait(view, f"not recognised: {found}")
+        self._motion.begin(frame)
         if found is not None:
-            placed = self._enter(view, scan, *found)
-        else:
-            self._made = self._add_keyframe(view, scan, np.eye(4), np.zeros((6, 6)))
-            placed = Placed(frame.stamp_ns, self._made, np.eye(4), np.zeros((6, 6)))
-        T_world_body, covariance = self.path.append(placed)
+            return self._placed(view, self._enter(view, scan, *found), Status.TRACKING, "")
+        self._made = self._add_keyframe(view, scan, np.eye(4), np.zeros((6, 6)))
+        placed = Placed(frame.stamp_ns, self._made, np.eye(4), np.zeros((6, 6)))
+        return self._placed(view, placed, Status.TRACKING, "")
+
+    def _wait(self, view: ScanView, reason: str) -> Estimate:
+        """Say that there is no place yet to say anything of."""
+        frame, identity = view.frame, SE3.identity()
         return Estimate(
-            frame.id, frame.stamp_ns, Status.TRACKING, "", placed.keyframe_id,
-            SE3(placed.T_keyframe_body), SE3(T_world_body), covariance, len(scan),
-            self._is_mapping, view.clock.laps,
+            frame.id, frame.stamp_ns, Status.INITIALIZING, reason, -1, identity, identity,
+            np.zeros((6, 6)), timing=view.clock.laps,
         )  # fmt: skip
+
+    def _placed(self, view: ScanView, placed: Placed, status: Status, reason: str) -> Estimate:
+        """Turn a place that does not come from the scan before into an estimate."""
+        self._wanted, self._judge.doubts = None, 0
+        self._motion.stop()
+        self._find_again()
+        T_world_body, covariance = self.path.append(placed)
+        count = 0 if view.scan is None else len(view.scan)
+        return Estimate(
+            view.frame.id, view.frame.stamp_ns, status, reason, placed.keyframe_id,
+            SE3(placed.T_keyframe_body), SE3(T_world_body), covariance, count,
+            self._made is not None, view.clock.laps,
+        )  # fmt: skip
+
+    def _go_blind(self, view: ScanView, reason: str, is_known: bool) -> Estimate:
+        """Go on without a scan: by odometry, where there is any and the body is not lost."""
+        if not is_known or self._is_lost:
+            return self._lose(view, reason)
+        return self._estimate(view, None, f"{reason}: followed by odometry alone")
+
+    def _seek(self, view: ScanView, scan: ScanPoints, reason: str, is_known: bool) -> Estimate:
+        """Find a scan that is not where it should be, or say what else is to become of it."""
+        config, loss, finder = self._config, self._loss, self._finder
+        active = self._submaps.active[0]
+        near = self._judge.around(active, scan, is_known)
+        if near is not None:
+            self._accept(near)
+            return self._estimate(view, near, "")
+        is_patient = loss.scans < config.patience
+        is_strange = loss.is_sudden and self._judge.contradicts(active, scan)
+        is_strange = is_strange or not is_known
+        if not is_strange and not self._is_lost:
+            if is_patient or not self._is_mapping:
+                return self._go_blind(view, reason, is_known)
+            return self._map_by_odometry(view, scan, reason)
+        found = finder.anywhere(self._places(), scan, config.lost_submaps)
+        view.clock.lap("track")
+        if not isinstance(found, str):
+            return self._return(view, *found)
+        is_long = loss.scans >= config.lost_scans and finder.rounds > 0
+        if self._is_mapping and is_long and (not is_known or loss.way >= config.lost_m):
+            return self._begin_piece(view, scan)
+        if is_patient:
+            return self._go_blind(view, reason, is_known)
+        return self._lose(view, f"{reason}; {found}")
+
+    def _places(self) -> list[Submap]:
+        """Return the submaps in which the body may be."""
+        return [*self._submaps.finished, *(self._submaps.active[:1] if self._is_mapping else ())]
+
+    def _map_by_odometry(self, view: ScanView, scan: ScanPoints, reason: str) -> Estimate:
+        """Begin submaps where only odometry says that the body is: nothing is known there."""
+        submap = self._submaps.active[0]
+        T_anchor_body = from_plane(submap.x_anchor_body)
+        place = Placed(
+            view.frame.stamp_ns,
+            submap.anchor_id,
+            T_anchor_body,
+            lift_covariance(submap.whole_covariance),
+        )
+        T_world_body = self._map.place(submap.anchor_id, T_anchor_body)
+        in_world = self.path.covariance(place)
+        self._submaps.leave()
+        self._made = self._add_keyframe(view, scan, T_world_body, in_world)
+        information = lift_information(np.asarray(np.linalg.inv(submap.whole_covariance)))
+        self._map.add_edge(submap.anchor_id, self._made, T_anchor_body, information, ODOMETRY)
+        placed = Placed(view.frame.stamp_ns, self._made, np.eye(4), np.zeros((6, 6)))
+        said = f"{reason}: mapped where odometry says"
+        return self._placed(view, placed, Status.TRACKING, said)
+
+    def _return(self, view: ScanView, submap: Submap, match: GridMatch) -> Estimate:
+        """Go on where a scan was recognised, on trial."""
+        self._trial.begin(submap, match, self._is_lost)
+        return self._lose(view, "recognised, and watched whether it stays so")
+
+    def _watch(self, view: ScanView, scan: ScanPoints, is_known: bool) -> Estimate:
+        """Go on where a scan was recognised, and believe it when scans have fitted for a while."""
+        trial = self._trial
+        match = trial.watch(scan, is_known)
+        if match is None:
+            self._loss.scans += trial.scans
+            estimate = self._lose(view, "what was recognised is not what is seen now")
+            self._is_lost = trial.was_lost
+            return estimate
+        if trial.left > 0:
+            return self._lose(view, f"recognised, and watched for {trial.left} more scans")
+        submap = trial.end()
+        assert submap is not None
+        if submap in self._submaps.active:
+            self._accept(match)
+            return self._estimate(view, match, FOUND)
+        if self._is_mapping:
+            self._submaps.leave()
+        placed = self._enter(view, scan, submap, match)
+        return self._placed(view, placed, Status.RECOVERED, FOUND)
+
+    def _begin_piece(self, view: ScanView, scan: ScanPoints) -> Estimate:
+        """Begin a piece of the map of which nothing is known relative to the others."""
+        last, unsure = self.path.last_pose(), self.path.gap_covariance(view.frame.stamp_ns)
+        self._submaps.leave()
+        k = self._made = self._add_keyframe(view, scan, last, unsure)
+        self._map.begin_piece(k)
+        self._submaps.pieces.enter(k, k)
+        placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
+        return self._placed(view, placed, Status.INITIALIZING, ANEW)
+
+    def _find_again(self) -> None:
+        """Take the body to be where it is believed to be."""
+        self._is_lost = False
+        self._loss.forget()
+        if not self._judge.doubts:
+            self._finder.forget()
 
     def _enter(self, view: ScanView, scan: ScanPoints, submap: Submap, match: GridMatch) -> Placed:
         """Go on in a submap of a map that was there, where a scan was recognised."""
@@ -191,6 +317,7 @@ class ScanTracker:
         T_world_body = self._map.place(anchor, T_anchor_body)
         in_world = self.path.covariance(place)
         self._made = self._add_keyframe(view, scan, T_world_body, in_world, anchor)
+        self._submaps.pieces.enter(self._made, self._submaps.piece_of(submap))
         information = lift_information(match.information)
         self._map.add_edge(anchor, self._made, T_anchor_body, information, LOOP)
         return Placed(stamp_ns, self._made, np.eye(4), np.zeros((6, 6)))
@@ -205,7 +332,8 @@ class ScanTracker:
 
     def _lose(self, view: ScanView, reason: str) -> Estimate:
         """Say that this scan has no pose of its own; it repeats the last one known."""
-        self._is_lost, self._step = True, np.zeros(3)
+        self._is_lost = True
+        self._motion.stop()
         last = self.path.last
         return Estimate(
             view.frame.id, view.frame.stamp_ns, Status.LOST, reason, last.keyframe_id,
@@ -222,13 +350,16 @@ class ScanTracker:
         before, T_before = self.path.last, self.path.last_pose()
         correction = self.path.correction()
         T_world_body, in_world = self.path.append(placed)
-        self._step = between_planar(to_plane(T_before), to_plane(T_world_body))
-        self._step_s = (placed.stamp_ns - before.stamp_ns) * 1e-9
+        step = between_planar(to_plane(T_before), to_plane(T_world_body))
+        self._motion.note(step, (placed.stamp_ns - before.stamp_ns) * 1e-9)
         status = Status.RECOVERED if self._is_lost or correction else Status.TRACKING
-        reason, self._is_lost = reason or correction, False
+        reason = reason or correction
+        if match is not None:
+            self._find_again()
         moved = np.hypot(*x_keyframe_body[:2]) > self._config.keyframe_m
         turned = abs(x_keyframe_body[2]) > self._config.keyframe_rad
-        is_keyframe = bool(self._is_mapping and match is not None and (moved or turned))
+        is_sure = self._is_mapping and match is not None and self._judge.is_settled
+        is_keyframe = bool(is_sure and (moved or turned))
         self._wanted = view if is_keyframe else None
         count = 0 if match is None or view.scan is None else round(match.on_walls * len(view.scan))
         return Estimate(
@@ -237,81 +368,6 @@ class ScanTracker:
         )  # fmt: skip
 
     # ---- parts ----
-
-    def _says_nothing(self, view: ScanView) -> str:
-        """Say why a scan says nothing; empty if it does."""
-        if view.scan is None:
-            return "no scan"
-        if len(view.scan) >= self._config.min_hits:
-            return ""
-        scan = view.scan
-        return (
-            f"{len(scan)} of {scan.num_beams} beams came back within reach, "
-            f"{self._config.min_hits} needed"
-        )
-
-    def _match(self, scan: ScanPoints, is_known: bool) -> GridMatch:
-        """Lay a scan onto the older active submap."""
-        submap, config = self._submaps.active[0], self._config
-        grid, x = submap.grid, submap.x_anchor_body
-        if self._is_lost and not is_known:
-            found = GridPyramid(grid).search(scan.hits, x, config.lost_reach, np.pi, 0.4)
-            return lay_on_grid(scan, grid, x if found is None else found.x_grid_body)
-        prior = np.asarray(np.linalg.inv(submap.covariance))
-        if not is_known:
-            x = search_near(grid, scan.hits, x, config.search, config.search_rad)
-        match = lay_on_grid(scan, grid, x, prior, submap.x_anchor_body)
-        off = between_planar(submap.x_anchor_body, match.x_grid_body)
-        if is_known and (match.on_walls < config.few_on_walls or off @ prior @ off > SURPRISE):
-            return self._match_anew(scan, match)
-        return match
-
-    def _match_anew(self, scan: ScanPoints, match: GridMatch) -> GridMatch:
-        """Look for a scan as if there was no odometry, as wheels slip, and some logs have it of
-        another instant; stay with a match unless clearly more of the scan meets walls elsewhere."""
-        submap, config = self._submaps.active[0], self._config
-        grid, expected = submap.grid, submap.x_anchor_body
-        x = search_near(grid, scan.hits, expected, config.slip_m, config.slip_rad)
-        wide = np.diag([config.slip_m, config.slip_m, config.slip_rad]) ** 2
-        prior = np.asarray(np.linalg.inv(submap.covariance + wide))
-        again = lay_on_grid(scan, grid, x, prior, expected)
-        if max(again.on_walls, match.on_walls) < config.few_on_walls:
-            window = expected, 2.0 * config.slip_m, 3.0 * config.slip_rad
-            found = GridPyramid(grid).search(scan.hits, *window, config.min_on_walls)
-            if found is not None:
-                x = found.x_grid_body
-                farther = lay_on_grid(scan, grid, x, prior, expected)
-                again = max(again, farther, key=lambda each: each.on_walls)
-        if again.on_walls < match.on_walls + MORE_ON_WALLS:
-            return match
-        self._submaps.move(np.zeros(3), wide)
-        self._since = self._since + wide
-        return again
-
-    def _motion(self, frame: Frame) -> tuple[Array, Array, bool]:
-        """Return the motion (3,) since the last frame, its noise (3, 3), and if it is measured."""
-        config, before = self._config, self._odometry
-        seconds = max((frame.stamp_ns - self._stamp_ns) * 1e-9, 0.0)
-        self._stamp_ns = max(frame.stamp_ns, self._stamp_ns)
-        self._odometry = self._read_odometry(frame)
-        is_known = before is not None and self._odometry is not None
-        if before is not None and self._odometry is not None:
-            motion, share = between_planar(before, self._odometry), config.slip
-            least = config.jitter, config.jitter_rad
-        else:
-            least = config.shake, config.shake_rad
-            usual = self._step_s if self._step_s > 0.0 else seconds
-            motion = self._step * (min(seconds / usual, 3.0) if usual > 0.0 else 1.0)
-            share = config.unsteady
-        way, turn = float(np.hypot(*motion[:2])), abs(float(motion[2]))
-        sigma = least[0] + share * way + 0.2 * config.slip * turn
-        sigma_rad = least[1] + share * turn + config.veer * way
-        return motion, np.diag([sigma, sigma, sigma_rad]) ** 2, is_known
-
-    def _read_odometry(self, frame: Frame) -> Array | None:
-        if frame.odometry is None or not self._config.use_odometry:
-            return None
-        return to_plane(frame.odometry)
 
     def _add_keyframe(
         self,
@@ -323,7 +379,8 @@ class ScanTracker:
     ) -> int:
         """Add a keyframe to the map, and its scan to the submaps."""
         k = self._map.new_keyframe_id()
-        keyframe = Keyframe(k, view.frame.stamp_ns, scan=view.frame.scan)
+        shown = None if view.scan is None else view.frame.scan
+        keyframe = Keyframe(k, view.frame.stamp_ns, scan=shown)
         # In the plane exactly: what corrections round, one on top of the other, would add up.
         T_world_body = from_plane(to_plane(T_world_body))
         self._map.add_keyframe(keyframe, T_world_body, parent=parent, covariance=covariance)

@@ -37,6 +37,7 @@ from odomap.lidar.grid import Evidence, OccupancyGrid
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.maps.map import Map
 from odomap.system.scanconfig import SubmapConfig
+from odomap.system.scanpieces import Pieces
 
 __all__ = ["SUBMAP", "Submap", "Submaps"]
 
@@ -111,12 +112,16 @@ class Submaps:
     Attributes:
         active: one or two that still grow, the older first.
         finished: the others, in order.
+        held: those that were active before a finished one was entered on trial.
+        pieces: which piece of the map each keyframe is in.
     """
 
     def __init__(self, map: Map, config: SubmapConfig | None = None) -> None:
         self._map, self.config = map, SubmapConfig() if config is None else config
         self.active: list[Submap] = []
         self.finished: list[Submap] = []
+        self.held: list[Submap] = []
+        self.pieces = Pieces(map)
 
     def add(self, keyframe_id: int, scan: ScanPoints, drift: Array) -> None:
         """Add a keyframe's scan where the active submaps have the body; begin and finish them.
@@ -148,6 +153,27 @@ class Submaps:
         full = self.active.pop(0)
         full.grid = full.grid.finished()
         self.finished.append(full)
+
+    def leave(self) -> None:
+        """Finish all that are active: what comes next was not measured in them."""
+        self.go_back()
+        while self.active:
+            self.finish()
+
+    def try_in(self, submap: Submap, x_anchor_body: Array, covariance: Array) -> None:
+        """Place scans in another submap for a while; those that grow are held."""
+        held = self.held or self.active
+        self.stay(submap, x_anchor_body, covariance)
+        self.held = held
+
+    def go_back(self) -> None:
+        """Place scans in those that grow again."""
+        if self.held:
+            self.active, self.held = self.held, []
+
+    def piece_of(self, submap: Submap) -> int:
+        """Return the piece of the map that a submap is in."""
+        return self.pieces.of(submap.anchor_id)
 
     def stay(self, submap: Submap, x_anchor_body: Array, covariance: Array) -> None:
         """Place scans in a finished submap, which does not change."""
@@ -203,7 +229,7 @@ class Submaps:
 
     def move(self, motion: Array, noise: Array) -> None:
         """Let the body move in all active submaps by a motion (3,), sure to (3, 3)."""
-        for submap in self.active:
+        for submap in (*self.active, *self.held):
             submap.x_anchor_body = compose_planar(submap.x_anchor_body, motion)
             submap.covariance = moved_covariance(submap.covariance, motion) + noise
 
