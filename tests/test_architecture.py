@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import grimp
@@ -41,9 +42,25 @@ def graph():
     return grimp.build_graph("odomap", cache_dir=None)
 
 
-@pytest.fixture(scope="module", params=FILES, ids=name_of)
-def module(request):
-    return request.param, ast.parse(request.param.read_text("utf-8"))
+@cache
+def modules():
+    return [(path, ast.parse(path.read_text("utf-8"))) for path in FILES]
+
+
+def of_each_module(check):
+    """Make one test of a check of a module: it tells the faults of all of them at once."""
+
+    def test():
+        assert len(modules()) > 100
+        faults = []
+        for path, tree in modules():
+            try:
+                check(path, tree)
+            except AssertionError as error:
+                faults.append(f"{name_of(path)}: {error}")
+        assert not faults, "\n".join(faults)
+
+    return test
 
 
 def test_rooms_stand_on_floors(capsys):
@@ -64,10 +81,10 @@ def test_the_graph_counts_lazy_and_type_only_imports(graph):
     assert "odomap.sources.open" in lazy
 
 
-def test_a_file_is_short(module):
-    path, _ = module
+@of_each_module
+def test_a_file_is_short(path, tree):
     lines = len(path.read_text("utf-8").splitlines())
-    assert lines <= MAX_FILE, f"{name_of(path)}: {lines} lines"
+    assert lines <= MAX_FILE, f"{lines} lines"
 
 
 def is_kernel(function):
@@ -80,17 +97,17 @@ def length_of_docstring(node):
     return node.body[0].end_lineno - node.body[0].lineno + 1 if ast.get_docstring(node) else 0
 
 
-def test_a_function_is_short(module):
-    path, tree = module
+@of_each_module
+def test_a_function_is_short(path, tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             lines = node.end_lineno - node.lineno + 1 - length_of_docstring(node)
             limit = MAX_KERNEL if is_kernel(node) else MAX_FUNCTION
-            assert lines <= limit, f"{name_of(path)}: {node.name} has {lines} lines of {limit}"
+            assert lines <= limit, f"{node.name} has {lines} lines of {limit}"
 
 
-def test_a_module_says_what_it_offers(module):
-    path, tree = module
+@of_each_module
+def test_a_module_says_what_it_offers(path, tree):
     if path.name in ("__init__.py", "__main__.py") and path.parent != SOURCE:
         return  # a room's door: its modules say it
     if path == SOURCE / "__main__.py":
@@ -100,32 +117,32 @@ def test_a_module_says_what_it_offers(module):
         for node in tree.body
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
     ]
-    assert "__all__" in targets, f"{name_of(path)} has no __all__"
+    assert "__all__" in targets, "has no __all__"
 
 
-def test_a_module_explains_itself(module):
-    path, tree = module
+@of_each_module
+def test_a_module_explains_itself(path, tree):
     text = ast.get_docstring(tree)
-    assert text, f"{name_of(path)} has no docstring"
-    assert len(text.splitlines()) <= 25, f"{name_of(path)}: the docstring is over 25 lines"
+    assert text, "has no docstring"
+    assert len(text.splitlines()) <= 25, "the docstring is over 25 lines"
 
 
-def test_no_module_is_a_drawer(module):
-    path, _ = module
+@of_each_module
+def test_no_module_is_a_drawer(path, tree):
     assert path.stem not in BANNED
     assert not set(path.relative_to(SOURCE).parts[:-1]) & BANNED
 
 
-def test_no_module_keeps_state(module):
-    path, tree = module
+@of_each_module
+def test_no_module_keeps_state(path, tree):
     for node in ast.walk(tree):
-        assert not isinstance(node, ast.Global), f"{name_of(path)}:{node.lineno}: global"
+        assert not isinstance(node, ast.Global), f"line {node.lineno}: global"
     for node in tree.body:
         values = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
         target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
         if isinstance(values, ast.List | ast.Set | ast.ListComp | ast.SetComp):
             assert isinstance(target, ast.Name)
-            assert target.id == "__all__", f"{name_of(path)}:{node.lineno}: a mutable {target.id}"
+            assert target.id == "__all__", f"line {node.lineno}: a mutable {target.id}"
 
 
 def test_importing_the_face_is_light():
@@ -136,8 +153,8 @@ def test_importing_the_face_is_light():
     assert not {"numba", "cv2"} & set(run.stdout.split())
 
 
-def test_only_the_worker_makes_threads(module):
-    path, tree = module
+@of_each_module
+def test_only_the_worker_makes_threads(path, tree):
     imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
     imported |= {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
     assert not imported & THREADS or name_of(path) in MAY_IMPORT_THREADS
