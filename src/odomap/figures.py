@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from odomap.errors import InputError
 from odomap.logbook import Logbook, skipped_numbers, versions
+from odomap.maps.atlas import Atlas
 from odomap.maps.edges import LOOP
 from odomap.maps.estimate import Status
 
@@ -71,6 +72,9 @@ def figures(
     if anew:
         times = "once" if len(anew) == 1 else f"{len(anew)} times"
         warnings.append(f"tracking {anew[0].reason} (frame {anew[0].frame_id}, {times} in all)")
+    pieces = len(Atlas(result.map).pieces)
+    if pieces > 1:
+        warnings.append(f"the map is in {pieces} pieces: where they are to each other is not known")
     if metrics["skipped"]:
         first, count = source.skipped[0], metrics["skipped"]
         what = "1 measurement" if count == 1 else f"{count} measurements, the first"

@@ -68,6 +68,20 @@ def test_a_grid_is_remade_where_a_loop_moved_the_keyframes():
     assert np.mean(away == 0) > 0.99
 
 
+def test_of_a_map_in_pieces_the_largest_is_shown():
+    m, rig = true_map(LASER, 10), recorded(LASER).rig
+    alone = grid_of_map(m, rig)
+    k = m.new_keyframe_id()
+    scan = m.keyframe(int(m.keyframe_ids[0])).scan
+    far = np.eye(4)
+    far[:2, 3] = 3.0, 2.0
+    m.add_keyframe(Keyframe(k, 10**19 // 2, scan=scan), far)
+    m.begin_piece(k)
+    made = grid_of_map(m, rig)
+    assert is_as(made.grid, alone.grid)
+    assert "the map is in 2 pieces" in made.notes[0]
+
+
 def test_no_return_is_free_only_where_that_is_asked_for():
     mount = LidarMount("laser", angles=(-1.0, 1.0, 5))
     m = Map()

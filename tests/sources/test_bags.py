@@ -236,6 +236,12 @@ def test_what_is_no_bag_says_so(tmp_path: Path) -> None:
         open_source(path, rig)
 
 
+def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
+    changes = {k: {"angle_min": -90.0, "angle_increment": 2.0} for k in range(SCANS)}
+    with pytest.raises(CalibrationError, match=r"a\.bag: lidar 'laser': angles .* in radians"):
+        opened(tmp_path, "ros1", Robot(changes=changes))
+
+
 def test_without_rosbags_the_mend_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_bag(tmp_path / "a.bag", "ros1")
     real = builtins.__import__

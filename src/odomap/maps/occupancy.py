@@ -32,6 +32,7 @@ from odomap.lidar.scanconfig import ScanConfig
 from odomap.lidar.scans import Beams
 from odomap.lidar.slices import SliceConfig, find_floor, level, slice_sweep
 from odomap.limits import Positive, check_limits
+from odomap.maps.atlas import Atlas
 from odomap.maps.map import Map
 from odomap.sensors.rig import LidarMount, Rig
 
@@ -141,11 +142,27 @@ def occupancy_grid(
 def grid_of_map(map: Map, rig: Rig, config: GridConfig | None = None) -> GridMap:
     """Make a grid as `occupancy_grid` does, and say where its keyframes are in it.
 
-    Of a map with 2D scans and with clouds the scans are used: nothing need be known of a floor.
+    Of a map with 2D scans and with clouds the scans are used: nothing need be known of a floor. Of
+    a map in pieces, whose places to each other are not known, the largest is shown.
     """
     config = GridConfig() if config is None else config
+    pieces = Atlas(map).pieces
+    largest = max(pieces, key=lambda piece: len(piece.keyframe_ids), default=None)
+    made = _grid_of_piece(map, rig, config, None if largest is None else largest.keyframe_ids)
+    if len(pieces) < 2 or largest is None:
+        return made
+    count, share = len(pieces), len(largest.keyframe_ids) / map.num_keyframes
+    note = f"the map is in {count} pieces, not known to each other: {share:.0%} of it are shown"
+    return replace(made, notes=(*made.notes, note))
+
+
+def _grid_of_piece(
+    map: Map, rig: Rig, config: GridConfig, keyframe_ids: NDArray[np.int64] | None
+) -> GridMap:
+    """Make a grid from some keyframes, as far as they live."""
     with map.lock:
         ids = map.keyframe_ids
+        ids = ids if keyframe_ids is None else ids[np.isin(ids, keyframe_ids)]
         Ts = np.asarray(map.Ts_world_body(ids)) if len(ids) else np.zeros((0, 4, 4))
         keyframes = [map.keyframe(k) for k in ids.tolist()]
     scans = [(T, k.scan) for T, k in zip(Ts, keyframes) if k.scan is not None]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import InputError, nearest_name
+from odomap.errors import CalibrationError, InputError, nearest_name
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
@@ -208,10 +208,13 @@ class BagSource:
         kind, between = self._kind, seen.between_s.most_common(1)[0][0][0]
         turns = "none" if between <= 0 else "clockwise" if kind.step < 0 else "counter_clockwise"
         last = kind.first + (kind.count - 1) * kind.step
-        return LidarMount(
-            tidy(frame) or "laser", SE3(T), (kind.nearest, kind.farthest),
-            rate_of(self.stamps_ns), turns, (kind.first, last, kind.count),
-        )  # fmt: skip
+        try:
+            return LidarMount(
+                tidy(frame) or "laser", SE3(T), (kind.nearest, kind.farthest),
+                rate_of(self.stamps_ns), turns, (kind.first, last, kind.count),
+            )  # fmt: skip
+        except CalibrationError as error:
+            raise CalibrationError(f"{self._bag.path}: {error}") from error
 
     def _details(self, seen: _Pass, topic: str, frame: str) -> dict[str, Any]:
         increment, scan_time = seen.between_s.most_common(1)[0][0]
