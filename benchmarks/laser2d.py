@@ -10,8 +10,8 @@
                beside it the wheels alone, and the same without loops. Bars: 0.0229 m and 0.453°,
                Cartographer's published figures.
     csail      how single walls are (`doublewalls`), beside the same without loops. Bars: loops are
-               closed, and no more walls stand twice than without. The rest is to be looked at: --out
-               keeps the grids and reports of both runs.
+               closed, and no more walls stand twice than without. The rest is to be looked at:
+               --out keeps the grids and reports of both runs.
     loop5      likewise.
     buildings  of several seeds: ATE, normalised error squared in the plane, and the grid against
                the true plan, laid on it with the path. Bars: 0.3 % of the path, on the mean; 95 %
