@@ -78,12 +78,12 @@ def test_each_point_of_a_sweep_is_measured_at_its_own_time(ideal_room: World, tu
         ideal_room.scene, ideal_room.path, mount, 2.0, LidarNoise.none(), np.random.default_rng(0),
         rings=4, columns=200,
     )  # fmt: skip
-    assert 0.0 <= cloud[:, 3].min() < 0.002
-    assert 0.09 < cloud[:, 3].max() < 0.1
-    azimuth = np.unwrap(np.arctan2(cloud[::4, 1], cloud[::4, 0]))
+    assert 0.0 <= cloud.times.min() < 0.002
+    assert 0.09 < cloud.times.max() < 0.1
+    azimuth = np.unwrap(np.arctan2(cloud.points[::4, 1], cloud.points[::4, 0]))
     assert np.sign(azimuth[-1] - azimuth[0]) == (-1 if turn == "clockwise" else 1)
-    Ts = ideal_room.path.at(2.0 + cloud[:, 3]).Ts_world_body
-    points = np.einsum("nij,nj->ni", Ts[:, :3, :3], cloud[:, :3]) + Ts[:, :3, 3]
+    Ts = ideal_room.path.at(2.0 + cloud.times).Ts_world_body
+    points = np.einsum("nij,nj->ni", Ts[:, :3, :3], cloud.points) + Ts[:, :3, 3]
     assert distance_to_surfaces(ideal_room, points).max() < 1e-9
-    frozen = cloud[:, :3] @ Ts[0, :3, :3].T + Ts[0, :3, 3]
+    frozen = cloud.points @ Ts[0, :3, :3].T + Ts[0, :3, 3]
     assert distance_to_surfaces(ideal_room, frozen).max() > 0.005

@@ -12,7 +12,7 @@ Version 1 (lengths in metres, times in seconds, T_a_b maps b to a, four rows of 
           accel_walk: 3.0e-3}
     lidars:
       - {name: top, T_body_lidar: [[...], ...], range_m: [0.5, 100.0], rate_hz: 10.0,
-         sweep: clockwise}
+         sweep: clockwise, beams: 64}
 
 Models and their coefficients are those of `geometry.camera`: pinhole, kannala_brandt (k1 k2 k3 k4),
 double_sphere (xi, alpha). A mount that is not given is the identity. Unknown fields are errors, so
@@ -132,7 +132,7 @@ def _imu(fields: Fields) -> ImuMount:
 
 
 def _lidar(fields: Fields) -> LidarMount:
-    fields.allow("name", "T_body_lidar", "range_m", "rate_hz", "sweep", "angles")
+    fields.allow("name", "T_body_lidar", "range_m", "rate_hz", "sweep", "angles", "beams")
     default = LidarMount("")
     near, far = fields.numbers("range_m", (2,)) if "range_m" in fields else default.range_m
     first, last, beams = fields.numbers("angles", (3,)) if "angles" in fields else default.angles
@@ -144,6 +144,7 @@ def _lidar(fields: Fields) -> LidarMount:
             fields.number("rate_hz", default.rate_hz),
             fields.text("sweep", default.sweep),
             (float(first), float(last), int(beams)),
+            int(fields.number("beams", default.beams)),
         )
     except InputError as error:
         raise located(fields, error) from error
@@ -212,4 +213,5 @@ def _lidar_fields(mount: LidarMount) -> dict[str, Any]:
         "rate_hz": float(mount.rate_hz),
         "sweep": mount.sweep,
         "angles": [float(mount.angles[0]), float(mount.angles[1]), int(mount.angles[2])],
+        "beams": int(mount.beams),
     }

@@ -30,7 +30,8 @@ class Keyframe:
         stamp_ns: time, integer nanoseconds.
         features: image features of the reference camera.
         scan: (N,) ranges of a 2D scan, metres.
-        cloud: (N, 3) or (N, 4) points of a 3D sweep, LiDAR frame, metres.
+        cloud: (N, 3) or (N, 4) points of a 3D sweep, metres, as seen from where the LiDAR was at
+            the stamp, and how strongly each returned.
         submap: a finished submap, frozen.
         imu: inertial samples since the keyframe before.
     """

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.sensors.sweep import Sweep
+
 __all__ = ["Frame", "ImuSamples"]
 
 
@@ -84,7 +86,7 @@ class Frame:
         images: one entry per camera of the rig, in its order: (H, W) uint8, or None if missing.
         depth: (H, W) float32 metres registered to the rig's depth camera, 0 where unknown.
         scan: 2D scan: (N,) float64 ranges in metres, NaN where invalid, inf where nothing returned.
-        cloud: 3D sweep: (N, 4) float64 x, y, z in the LiDAR frame and seconds since `stamp_ns`.
+        cloud: 3D sweep, of points each at its own moment.
         imu: the samples after the previous frame, up to and including this one's stamp.
         odometry: (4, 4) T_odom_body by the wheels' own reckoning at this stamp; it drifts, so only
             steps from frame to frame mean something. None where no wheels are read.
@@ -95,7 +97,7 @@ class Frame:
     images: tuple[NDArray[np.uint8] | None, ...] = ()
     depth: NDArray[np.float32] | None = None
     scan: NDArray[np.float64] | None = None
-    cloud: NDArray[np.float64] | None = None
+    cloud: Sweep | None = None
     imu: ImuSamples | None = None
     odometry: NDArray[np.float64] | None = None
 
@@ -107,6 +109,8 @@ class Frame:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Yield the arrays of this frame (for counting bytes, or freezing them)."""
         yield from (image for image in self.images if image is not None)
-        yield from (a for a in (self.depth, self.scan, self.cloud, self.odometry) if a is not None)
+        yield from (a for a in (self.depth, self.scan, self.odometry) if a is not None)
+        if self.cloud is not None:
+            yield from self.cloud.arrays()
         if self.imu is not None:
             yield from (self.imu.stamps_ns, self.imu.gyro, self.imu.accel)

@@ -111,6 +111,8 @@ class LidarMount:
     """"clockwise", "counter_clockwise", or "none" for an instantaneous scan."""
     angles: tuple[float, float, int] = (0.0, 0.0, 0)
     """First angle, last angle (radians) and number of beams of a 2D scan; 0 beams for 3D."""
+    beams: int = 0
+    """Beams above each other of a 3D LiDAR; 0 where it is not known, or there is no such order."""
 
     def __post_init__(self) -> None:
         sweeps = ("clockwise", "counter_clockwise", "none")
@@ -130,6 +132,10 @@ class LidarMount:
             raise CalibrationError(
                 f"lidar '{self.name}': angles [{first}, {last}, {beams}] must be first, last, and "
                 "how many beams"
+            )
+        if not 0 <= self.beams <= 1024:
+            raise CalibrationError(
+                f"lidar '{self.name}': beams {self.beams} must be how many are above each other"
             )
         if abs(last - first) > MOST_VIEW:
             raise CalibrationError(

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.sensors.rig import LidarMount
+from odomap.sensors.sweep import Sweep
 from odomap.simulation.path import Path
 from odomap.simulation.rays import cast_kernel
 from odomap.simulation.scene import Scene
@@ -77,7 +78,7 @@ def sweep(
     scene: Scene, path: Path, mount: LidarMount, time: float, noise: LidarNoise,
     rng: np.random.Generator, *, rings: int = 32, columns: int = 900,
     elevations_deg: tuple[float, float] = (-25.0, 10.0),
-) -> Array:  # fmt: skip
+) -> Sweep:  # fmt: skip
     """Take one 3D sweep that starts at a time.
 
     Args:
@@ -92,12 +93,13 @@ def sweep(
         elevations_deg: lowest and highest beam.
 
     Returns:
-        (N, 4) x, y, z in the LiDAR at the moment of each point, and seconds since `time`.
+        What returned, with times since `time` and beams.
     """
     turn = {"clockwise": -1.0, "counter_clockwise": 1.0, "none": 1.0}[mount.sweep]
     share = np.repeat(np.arange(columns) / columns, rings)
     azimuth = np.pi + turn * 2 * np.pi * share
-    elevation = np.radians(np.tile(np.linspace(*elevations_deg, rings), columns))
+    beams = np.tile(np.arange(rings, dtype=np.int16), columns)
+    elevation = np.radians(np.linspace(*elevations_deg, rings))[beams]
     directions = np.column_stack(
         [
             np.cos(elevation) * np.cos(azimuth),
@@ -108,7 +110,7 @@ def sweep(
     delays = np.zeros(len(share)) if mount.sweep == "none" else share / mount.rate_hz
     ranges = _ranges(scene, path, mount, time + delays, directions, noise, rng)
     kept = np.isfinite(ranges)
-    return np.column_stack([directions[kept] * ranges[kept, None], delays[kept]])
+    return Sweep(directions[kept] * ranges[kept, None], delays[kept], None, beams[kept])
 
 
 def _ranges(

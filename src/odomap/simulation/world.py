@@ -21,6 +21,7 @@ from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame, ImuSamples
 from odomap.sensors.rig import CameraMount, DepthMount, ImuMount, LidarMount, Rig
+from odomap.sensors.sweep import Sweep
 from odomap.simulation.building import building, corridor
 from odomap.simulation.exposure import ImageNoise, expose, measure_depth
 from odomap.simulation.imu import imu_samples
@@ -241,7 +242,7 @@ class World:
         mount, time, noise, rng = self._lidar(index)
         return scan(self.scene, self._path, mount, time, noise, rng)
 
-    def _cloud(self, index: int) -> Array:
+    def _cloud(self, index: int) -> Sweep:
         mount, time, noise, rng = self._lidar(index)
         return sweep(self.scene, self._path, mount, time, noise, rng)
 
