@@ -47,11 +47,13 @@ class Clock:
         file: a file of times, or None.
         rate_hz: nominal rate of the camera; 0 when unknown.
         folder: where the images are, for messages.
+        kind: what they are, for messages.
     """
 
     file: Path | None
     rate_hz: float
     folder: Path
+    kind: str = "images"
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -126,11 +128,11 @@ def stamp_names(
         InputError: the file of times fits none of them.
     """
     if clock.file is not None:
-        rows, where, unit = _from_file(clock.file, names, left_out, notes), clock.file, "s"
+        rows, where, unit = _from_file(clock, clock.file, names, left_out, notes), clock.file, "s"
     else:
         found = _clock_unit(names)
         if found is None:
-            return list(range(len(names))), _at_rate(names, clock.rate_hz, notes)
+            return list(range(len(names))), _at_rate(names, clock, notes)
         rows = [(0, _last(name), str(place)) for place, name in enumerate(names)]
         where, unit = clock.folder, found
     listing = list_rows(rows, unit, clock.rate_hz, where, where.name)
@@ -140,7 +142,7 @@ def stamp_names(
 
 
 def _from_file(
-    file: Path, names: Sequence[str], left_out: list[Skipped], notes: list[str]
+    clock: Clock, file: Path, names: Sequence[str], left_out: list[Skipped], notes: list[str]
 ) -> list[tuple[int, str, str]]:
     """Return (line, time, place of the image) of each image that a file of times tells of."""
     lines = list(read_lines(file))
@@ -162,7 +164,7 @@ def _from_file(
             if number < len(lines)
         ]
         if not is_counted and len(lines) != len(names):
-            notes.append(f"{file.name} has {len(lines)} times for {len(names)} images")
+            notes.append(f"{file.name} has {len(lines)} times for {len(names)} {clock.kind}")
     timed = {int(place) for _, _, place in rows}
     left_out += [
         Skipped(0, name, f"{file.name} has no time for it")
@@ -170,7 +172,7 @@ def _from_file(
         if place not in timed
     ]
     if not rows:
-        raise InputError(f"{file}: {len(lines)} times for {len(names)} images: none matches")
+        raise InputError(f"{file}: {len(lines)} times for {len(names)} {clock.kind}: none matches")
     return rows
 
 
@@ -216,9 +218,9 @@ def _clock_stamps(names: Sequence[str]) -> NDArray[np.int64] | None:
     return listing.stamps_ns if len(listing) == len(names) else None
 
 
-def _at_rate(names: Sequence[str], rate_hz: float, notes: list[str]) -> NDArray[np.int64]:
+def _at_rate(names: Sequence[str], clock: Clock, notes: list[str]) -> NDArray[np.int64]:
     """Return stamps at a rate, with gaps where numbers are missing."""
-    rate = rate_hz or RATE_HZ
+    rate = clock.rate_hz or RATE_HZ
     counters = np.array(_numbers(names), np.float64)
     steps = np.diff(counters)
     places = np.arange(len(names), dtype=np.float64)
@@ -226,9 +228,10 @@ def _at_rate(names: Sequence[str], rate_hz: float, notes: list[str]) -> NDArray[
         counted = (counters - counters[0]) / float(np.median(steps))
         if counted[-1] <= SPARSE * len(names) and np.all(counted == np.round(counted)):
             places = counted
-    whose = "rate_hz of the calibration" if rate_hz else "set rate_hz in rig.yaml if that is wrong"
+    known = "rate_hz of the calibration" if clock.kind == "images" else "the usual rate"
+    whose = known if clock.rate_hz else "set rate_hz in rig.yaml if that is wrong"
     notes.append(
-        f"neither times.txt nor the names tell when images were taken: they are taken to be "
+        f"neither times.txt nor the names tell when {clock.kind} were taken: they are taken to be "
         f"{1e3 / rate:.4g} ms apart ({whose})"
     )
     return np.round(places * 1e9 / rate).astype(np.int64)

@@ -5,6 +5,7 @@ Recognised by what a folder holds, not by its name:
     EuRoC ASL         mav0/cam0/data.csv (or the inside of mav0)
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
+    KITTI velodyne    velodyne/*.bin, times.txt; or velodyne_points/data/*.bin
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
     laser log         a file: CARMEN's (.clf, .log, also .bz2 or .gz), or Odometry and Laser lines
@@ -33,13 +34,15 @@ from odomap.sources.options import check_options, split_options
 from odomap.sources.plainlog import WORDS, PlainLogSource
 from odomap.sources.source import Source
 from odomap.sources.tum import TumSource, is_tum
+from odomap.sources.velodyne import VelodyneSource, is_velodyne
 from odomap.sources.video import VideoSource, is_video
 
 __all__ = ["SUPPORTED", "open"]
 
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
-    "TUM RGB-D (rgb.txt, depth.txt), videos (.mp4, .mov, .avi, .mkv, ...), "
+    "KITTI velodyne (velodyne/*.bin), TUM RGB-D (rgb.txt, depth.txt), "
+    "videos (.mp4, .mov, .avi, .mkv, ...), "
     "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
     "bags of ROS 1 and 2 with laser scans (.bag, .mcap, .db3, or the folder of one), "
     "live cameras ('camera:0'), "
@@ -105,6 +108,8 @@ def _bag(path: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
 def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
     if not root.exists():
         raise InputError(_missing(root))
+    if root.is_dir() and not is_kitti(root) and is_velodyne(root):
+        return VelodyneSource(root, _rig(root, rig, calibrated=False), options)
     if options and not is_bag(root):
         check_options(root, options, ())
     if root.is_file():
@@ -133,13 +138,15 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
     raise InputError(_unrecognised(root))
 
 
-def _rig(root: Path, rig: Rig | str | Path | None) -> Rig | None:
+def _rig(root: Path, rig: Rig | str | Path | None, calibrated: bool | None = None) -> Rig | None:
+    """Return the given rig, or that beside a recording that is not calibrated itself."""
     if rig is not None:
         return load_rig(rig)
-    calibrated = any(
-        (root / name).exists()
-        for name in ("calib.txt", "mav0/cam0/sensor.yaml", "cam0/sensor.yaml")
-    )
+    if calibrated is None:
+        calibrated = any(
+            (root / name).exists()
+            for name in ("calib.txt", "mav0/cam0/sensor.yaml", "cam0/sensor.yaml")
+        )
     return None if calibrated else rig_beside([root / "rig.yaml"])
 
 

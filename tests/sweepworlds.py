@@ -1,0 +1,72 @@
+"""Sweeps of a LiDAR on a flat road between walls, ring by ring, and files made of them."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+HEIGHT = 1.7
+HALF_WIDTH = 12.0
+PERIOD = 0.1
+
+
+def elevations(beams: int) -> Array:
+    """Return (beams,) from the highest beam down, radians, as uneven as those of an HDL-64E."""
+    upper = np.linspace(2.0, -8.5, beams // 2)
+    return np.radians(np.r_[upper, np.linspace(-9.0, -24.0, beams - beams // 2)])
+
+
+def road(
+    beams: int = 64, columns: int = 720, seed: int = 0, lost: float = 0.02, jitter: float = 0.002
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return a sweep, ring by ring from the highest, each from ahead to the left and around.
+
+    Args:
+        beams: rings.
+        columns: points of a ring, before some are lost.
+        seed: of what is lost.
+        lost: share of points that do not return.
+        jitter: of azimuths, radians, as sorted rows have it.
+
+    Returns:
+        (N, 3) points, and (N,) which beam each is of, 0 for the lowest.
+    """
+    rng = np.random.default_rng(seed)
+    azimuth = (np.arange(columns) + 0.5) / columns * 2 * np.pi
+    rows, numbers = [], []
+    for k, elevation in enumerate(elevations(beams)):
+        phi = azimuth + rng.normal(0, jitter, columns)
+        ray = np.stack(
+            [np.cos(elevation) * np.cos(phi), np.cos(elevation) * np.sin(phi),
+             np.full(columns, np.sin(elevation))], axis=1,
+        )  # fmt: skip
+        with np.errstate(divide="ignore"):
+            to_ground = np.where(ray[:, 2] < 0, -HEIGHT / ray[:, 2], np.inf)
+            to_wall = HALF_WIDTH / np.abs(ray[:, 1])
+        distance = np.minimum(to_ground, to_wall)
+        kept = (rng.random(columns) >= lost) & (distance < 80)
+        rows.append(ray[kept] * distance[kept, None])
+        numbers.append(np.full(kept.sum(), beams - 1 - k))
+    return np.concatenate(rows), np.concatenate(numbers)
+
+
+def write_velodyne(root: Path, frames: int = 5, beams: int = 64, columns: int = 720) -> Path:
+    """Write sweeps as KITTI does, with times and truth of a car at 10 m/s."""
+    (root / "velodyne").mkdir(parents=True)
+    for k in range(frames):
+        points, _ = road(beams, columns, seed=k)
+        rows = np.c_[points, np.linspace(0, 1, len(points))].astype("<f4")
+        (root / "velodyne" / f"{k:06d}.bin").write_bytes(rows.tobytes())
+    times = [k * PERIOD for k in range(frames)]
+    (root / "times.txt").write_text("".join(f"{t:.6f}\n" for t in times))
+    poses = [f"1 0 0 {10 * t} 0 1 0 0 0 0 1 0\n" for t in times]
+    (root / "poses_velodyne.txt").write_text("".join(poses))
+    return root
+
+
+def compensated(points: Array, speed: float = 10.0, period: float = PERIOD) -> Array:
+    """Return a sweep with the motion of a car taken out, as the odometry benchmark has them."""
+    times = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) * period
+    return points + np.outer(times, [speed, 0.0, 0.0])
