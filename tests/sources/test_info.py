@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from odomap.cli import main
+from sweepworlds import write_velodyne
 
 Make = Callable[..., Path]
 Call = Callable[..., tuple[int, str, str]]
@@ -35,6 +36,38 @@ def test_tum(tum: Make, info: Call) -> None:
     assert "depth          5000 per metre, registered to rgb, of 8 frames; +3 ms from colour" in out
     assert "ground truth   9 poses, 0.80 m, covers 7 frames" in out
     assert "readable       8" in out
+
+
+def test_sweeps(tmp_path: Path, info: Call) -> None:
+    root = write_velodyne(tmp_path / "drive", frames=4)
+    code, out, _ = info(root, "--check")
+    assert code == 0
+    assert out.startswith("drive (velodyne)\n  frames         4 in 0.30 s, 10 Hz\n")
+    assert "readable       4" in out
+    assert "lidar velodyne 64 beams above each other, 1 to 120 m, 10 Hz, clockwise sweep" in out
+    assert "-24° to 2" in out
+    assert "360° around" in out
+    assert "point times    -50 to 50 ms, from the azimuth" in out
+    assert "beams          64, from the order of the rows" in out
+    assert "intensity      0 to 1" in out
+    code, out, _ = info(f"{root}?times=off", "--json")
+    facts = json.loads(out)
+    assert facts["sweeps"]["times"] == ""
+    assert facts["sweeps"]["beams"] == 64
+    assert facts["gaps"] == []
+    assert "point times    none" in info(f"{root}?times=off")[1]
+    (root / "times.txt").write_text("0.0\n0.1\n0.2\n1.2\n")
+    assert "gap            1.000 s after frame 2" in info(root)[1]
+
+
+def test_truncated_sweep(tmp_path: Path, info: Call) -> None:
+    root = write_velodyne(tmp_path / "drive", frames=3)
+    file = root / "velodyne" / "000001.bin"
+    file.write_bytes(file.read_bytes()[:-1])
+    code, out, _ = info(root, "--check")
+    assert code == 0
+    assert "readable       2" in out
+    assert f"skipped        {file}: " in out
 
 
 def test_video(clip: Make, info: Call) -> None:

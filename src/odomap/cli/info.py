@@ -88,6 +88,8 @@ def lines(facts: dict[str, Any]) -> list[str]:
     rows += [(f"lidar {lidar['name']}", _lidar(lidar)) for lidar in facts["lidars"]]
     if facts["scans"]:
         rows += _scans(facts["scans"])
+    if facts["sweeps"]:
+        rows += _sweeps(facts["sweeps"])
     rows.append(("body", facts["body"] or "a frame of its own, none of these sensors"))
     rows.append(("ground truth", _truth(facts)))
     for gap in facts["gaps"][:10]:
@@ -135,7 +137,9 @@ def _camera(camera: dict[str, Any]) -> str:
 def _lidar(lidar: dict[str, Any]) -> str:
     near, far = lidar["range_m"]
     text = f"{near:g} to {far:g} m, {lidar['rate_hz']:g} Hz"
-    if "beams" in lidar:
+    if "angles_deg" not in lidar and "beams" in lidar:
+        text = f"{lidar['beams']} beams above each other, {text}"
+    if "angles_deg" in lidar:
         first, last = lidar["angles_deg"]
         view = f"{lidar['beams']} beams from {first:g}° to {last:g}°, every {lidar['step_deg']:g}°"
         text = f"{view}, {text}"
@@ -151,6 +155,25 @@ def _scans(scans: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("invalid", f"{scans['share_invalid']:.2%} of the beams"))
     path = scans["odometry_path_m"]
     rows.append(("odometry", "none" if path is None else f"of the wheels, {path:.2f} m"))
+    return rows
+
+
+def _sweeps(sweeps: dict[str, Any]) -> list[tuple[str, str]]:
+    fewest, usual, most = sweeps["points"]
+    low, high = sweeps["elevation_deg"]
+    near, far = sweeps["range_m"]
+    text = f"{usual} points ({fewest} to {most}), {near:g} to {far:g} m"
+    text += f", {low:g}° to {high:g}° high, {sweeps['view_deg']:g}° around"
+    if sweeps["share_no_return"]:
+        text += f", {sweeps['share_no_return']:.2%} of the rows are no return"
+    times = "none: a sweep is taken as of one instant, or the rig says how it turns"
+    if sweeps["times"]:
+        first, last = (1e3 * t for t in sweeps["times_s"])
+        times = f"{first:.4g} to {last:.4g} ms, {sweeps['times']}"
+    beams = f"{sweeps['beams']}, {sweeps['beams_by']}" if sweeps["beams"] else "not known"
+    rows = [("sweeps", text), ("point times", times), ("beams", beams)]
+    if sweeps["intensities"] is not None:
+        rows.append(("intensity", "{:g} to {:g}".format(*sweeps["intensities"])))
     return rows
 
 

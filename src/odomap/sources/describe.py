@@ -1,7 +1,8 @@
 """What a recording holds, in numbers: for `odomap info`, and to see at once what is odd about it.
 
-Stamps are read, images are not. A gap is a step between frames longer than three usual (median)
-ones: no error, since recordings have them, but worth knowing, since a tracker may get lost there.
+Stamps are read, images are not; of sweeps a few are. A gap is a step between frames longer than
+three usual (median) ones: no error, since recordings have them, but worth knowing, since a tracker
+may get lost there.
 """
 
 from typing import Any
@@ -14,6 +15,7 @@ from odomap.sensors.rig import LidarMount, Rig
 from odomap.sources.depth import DepthFiles
 from odomap.sources.scans import Beams
 from odomap.sources.source import RandomAccess, Source
+from odomap.sources.survey import SweepSurvey, survey_frames
 
 __all__ = ["describe"]
 
@@ -28,8 +30,9 @@ def describe(source: Source) -> dict[str, Any]:
 
     Returns:
         Plain numbers, texts, lists and mappings: name, format, frames, duration_s, rate_hz, gaps,
-        steps_s, cameras, stereo_baseline_m, depth, imu_rate_hz, lidars, scans, body, details,
-        truth, skipped, notes. Frames are None where they cannot be counted, as of a live camera.
+        steps_s, cameras, stereo_baseline_m, depth, imu_rate_hz, lidars, scans, sweeps, body,
+        details, truth, skipped, notes. Frames are None where they cannot be counted, as of a live
+        camera.
     """
     rig = source.rig
     return {
@@ -53,6 +56,7 @@ def describe(source: Source) -> dict[str, Any]:
         "imu_rate_hz": None if rig.imu is None else rig.imu.rate_hz,
         "lidars": [_lidar(mount) for mount in rig.lidars],
         "scans": _scans(source),
+        "sweeps": _sweeps(source),
         "body": rig.body_sensor,
         "details": dict(getattr(source, "details", {})),
         "truth": _truth(source),
@@ -97,6 +101,8 @@ def _lidar(mount: LidarMount) -> dict[str, Any]:
         "rate_hz": round(mount.rate_hz, 3),
         "sweep": mount.sweep,
     }
+    if mount.beams:
+        facts["beams"] = mount.beams
     if beams:
         facts |= {
             "beams": beams,
@@ -123,6 +129,28 @@ def _scans(source: Source) -> dict[str, Any] | None:
         facts["share_no_return"] = round(beams.share_no_return, 5)
         facts["share_invalid"] = round(beams.share_invalid, 5)
     return facts
+
+
+def _sweeps(source: Source) -> dict[str, Any] | None:
+    """Return what the sweeps of a 3D LiDAR are like."""
+    seen: SweepSurvey | None = getattr(source, "survey", None)
+    if seen is None:
+        is_3d = any(not mount.angles[2] for mount in source.rig.lidars)
+        if not is_3d or not isinstance(source, RandomAccess):
+            return None
+        seen = survey_frames(source)
+    return {
+        "points": list(seen.rows),
+        "share_no_return": round(seen.share_lost, 5),
+        "range_m": [round(r, 3) for r in seen.range_m],
+        "elevation_deg": [round(float(np.degrees(a)), 2) for a in seen.elevation],
+        "view_deg": round(float(np.degrees(seen.view)), 1),
+        "times": seen.times,
+        "times_s": [round(t, 6) for t in seen.span_s] if seen.times else None,
+        "beams": seen.beams,
+        "beams_by": seen.beams_how,
+        "intensities": None if seen.intensities is None else list(seen.intensities),
+    }
 
 
 def _depth(source: Source) -> dict[str, Any] | None:

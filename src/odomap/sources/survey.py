@@ -8,6 +8,7 @@ beams of one, its times) is taken from there without a look at each.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,13 @@ from numpy.typing import NDArray
 from odomap.errors import CalibrationError
 from odomap.sensors.rig import LidarMount, Rig
 from odomap.sensors.sweep import Sweep
-from odomap.sources.source import UnusableFrame
+from odomap.sources.source import RandomAccess, UnusableFrame
 
-__all__ = ["SweepSurvey", "mounted_sweeps", "sample", "survey"]
+__all__ = ["SweepSurvey", "mounted_sweeps", "sample", "survey", "survey_frames"]
 
-SAMPLES = 8
+Read = TypeVar("Read")
+
+SAMPLES, FEW_SAMPLES = 8, 2
 NEAR_M, FAR_M = 0.5, 120.0
 """Range of a LiDAR of which nothing is said: nearer is its carrier."""
 MOST_WRONG = 0.75
@@ -55,7 +58,7 @@ class SweepSurvey:
     intensities: tuple[float, float] | None = None
 
 
-def sample(count: int, read: Callable[[int], Sweep], most: int = SAMPLES) -> list[Sweep]:
+def sample(count: int, read: Callable[[int], Read], most: int = SAMPLES) -> list[Read]:
     """Read some sweeps of a recording, evenly spaced; those that cannot be read are left out.
 
     Args:
@@ -106,6 +109,19 @@ def survey(sweeps: Sequence[Sweep], times: str = "", beams: int = 0, how: str = 
         range_m=(float(distance.min()), float(distance.max())),
         elevation=(low, high),
         view=_view(np.arctan2(points[:, 1], points[:, 0])),
+    )
+
+
+def survey_frames(source: RandomAccess) -> SweepSurvey:
+    """Look at two sweeps of a source that has made no survey itself."""
+    frames = sample(len(source), source.frame, FEW_SAMPLES)
+    sweeps = [frame.cloud for frame in frames if frame.cloud is not None]
+    has_times = any(sweep.times is not None for sweep in sweeps)
+    beams = max(
+        (int(s.beams.max()) + 1 for s in sweeps if s.beams is not None and len(s)), default=0
+    )
+    return survey(
+        sweeps, "in the sweeps" if has_times else "", beams, "in the sweeps" * (beams > 0)
     )
 
 
