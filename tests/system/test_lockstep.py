@@ -110,12 +110,14 @@ class Written:
         self.solved.write(map)
 
 
-def make(mapping=1, closing=0, nap=lambda keyframe_id: 0.0, worker=LockstepWorker, loops=()):
+def make(
+    mapping=1, closing=0, nap=lambda keyframe_id: 0.0, worker=LockstepWorker, loops=(), line=0
+):
     m, log = Map(), []
     mapper = Lift(m, log, "mapper", nap)
     closer = Lift(m, log, "closer", lambda k: nap(k + 1000), loops)
     stages = Stages(m, Track(m, log), mapper, closer)
-    config = ThreadConfig(mapping_delay=mapping, closing_delay=closing)
+    config = ThreadConfig(mapping, closing, line)
     return (worker(stages) if worker is InlineWorker else worker(stages, config)), log
 
 
@@ -158,6 +160,33 @@ def test_a_change_is_written_before_its_stage_reads_again():
         *[("mapper reads", 2), ("mapper writes", 2), ("mapper reads", 3), ("mapper writes", 3)],
     ]
     assert log[-1] == ("closer writes", 3)
+
+
+def test_keyframes_wait_in_line_for_a_closer_that_is_busy():
+    worker, log = make(mapping=0, closing=5, line=1)
+    list(worker.run(frames(15)))
+    worker.finish()
+    of_closer = [event for event in log if event[0].startswith(("closer", "track"))]
+    assert of_closer == [
+        *[("track", 0), ("closer reads", 0), ("track", 1), ("track", 2), ("track", 3)],
+        *[("closer reads", 1), *(("track", n) for n in (4, 5, 6, 7))],  # the second one waits
+        *[("closer writes", 1), ("closer reads", 2), ("track", 8), ("track", 9), ("track", 10)],
+        *[("track", 11), ("track", 12)],  # the third one waits; with the fourth the line is full
+        *[("closer writes", 2), ("closer reads", 3), ("track", 13), ("track", 14)],
+        *[("closer writes", 3), ("closer reads", 4), ("closer writes", 4)],
+    ]
+
+
+@pytest.mark.parametrize("line", [1, 4])
+def test_who_waits_in_line_does_not_depend_on_time(line):
+    expected = result(make(1, 7, line=line), 40)
+    random = np.random.default_rng(line)
+    naps = random.uniform(0, 0.01, 2000) * (random.uniform(size=2000) < 0.5)
+    assert result(make(1, 7, lambda k: naps[k], line=line), 40) == expected
+    kept, _ = make(1, 7, line=line)
+    list(kept.run(frames(8)))
+    kept.close()
+    kept.finish()  # what was in line is lost, and nothing waits for it
 
 
 def test_without_delay_it_is_inline_byte_for_byte():

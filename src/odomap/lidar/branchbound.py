@@ -2,8 +2,8 @@
 
 A pose is as good as its points lie on walls, s(x) = Σ_i m(T_x p_i), where m is 1 in cells that are
 rather occupied than free, one half beside them, for poses are tried in steps of a cell, and 0
-elsewhere. All headings that differ by a cell at the farthest point, and all shifts by whole cells,
-are candidates: some hundred thousand. Shifts are taken together, 2^h by 2^h of them, and bounded by
+elsewhere. All headings that differ by a cell at far points, and all shifts by whole cells, are
+candidates: some hundred thousand. Shifts are taken together, 2^h by 2^h of them, and bounded by
 what the best cell near each point could give,
 
     m_h(c) = max_{0 ≤ a, b < 2^h} m(c + (a, b)),     s(x) ≤ Σ_i m_h(T_x p_i),
@@ -34,6 +34,10 @@ Columns = NDArray[np.int32]
 
 FULL, HALF = np.uint8(255), np.uint8(128)
 """m = 1 and 1/2, as they are kept."""
+MOST = 180
+"""Points that are searched with; of more every second, third, ..., for neighbours say the same."""
+FAR = 0.8
+"""Share of the points that move by less than a cell from one heading to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class Found:
     """The best pose of a search.
 
     Attributes:
-        x_grid_body: (3,) x, y, heading; to a cell, and to a cell at the farthest point.
+        x_grid_body: (3,) x, y, heading; to a cell, and to a cell at far points.
         score: mean m of its points there, 0 to 1.
     """
 
@@ -83,8 +87,9 @@ class GridPyramid:
         Returns:
             The best; of equal ones always the same. None if none is better than `least`.
         """
-        farthest = max(float(np.linalg.norm(points_body, axis=1).max()), self.resolution)
-        step = self.resolution / farthest
+        points_body = points_body[:: -(-len(points_body) // MOST)]
+        far = float(np.quantile(np.linalg.norm(points_body, axis=1), FAR))
+        step = self.resolution / max(far, self.resolution)
         count = int(np.ceil(min(turn, np.pi) / step))
         headings = x_middle[2] + step * np.arange(-count, count + 1)
         c, s = np.cos(headings)[:, None], np.sin(headings)[:, None]

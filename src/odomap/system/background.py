@@ -42,6 +42,8 @@ class ThreadConfig:
     next frame does, and the mapper works while it is read; 0 works inline."""
     closing_delay: Frames = 20
     """Lockstep: frames from the search for a loop to the one that sees the path corrected."""
+    closing_line: Frames = 0
+    """Lockstep: keyframes that may wait for the closer; with one more, tracking waits for it."""
     adjusting_pace: Frames = 2000
     """Lockstep: observations adjusted in the time of a frame, so that a large map is seen adjusted
     later than a small one, and none before `closing_delay`; 0 works inline."""

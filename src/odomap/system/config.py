@@ -173,7 +173,12 @@ def _rgbd_flow() -> Config:
 
 
 def _lidar2d() -> Config:
-    return Config(tracking=TrackingConfig(sensors="lidar2d"), closing=NO_LOOPS)
+    # Nearly every scan of a quick robot is a keyframe, and few of them cost the closer much.
+    return Config(
+        tracking=TrackingConfig(sensors="lidar2d"),
+        closing=NO_LOOPS,
+        threads=ThreadConfig(closing_line=4),
+    )
 
 
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(

@@ -104,7 +104,7 @@ class ScanClosingConfig:
 
     enabled: bool = True
     """Whether places seen before are searched for."""
-    every: Count = 2
+    every: Count = 3
     """Keyframes after which one is searched for."""
     most: Count = 2
     """Submaps that it is searched for in."""
