@@ -8,7 +8,7 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sources.simulated import SimulatedSource
 
-SWEEPS = "sim:room?seed=2&frames=60&sensors=lidar3d"
+SWEEPS = "sim:room?seed=2&frames=60&rate_hz=20&columns=900&sensors=lidar3d"
 DEPTH = "sim:room?seed=1&frames=300&resolution=320x200&sensors=mono,depth"
 LASER = "sim:hall?seed=1&sensors=laser&frames=200"
 
@@ -32,15 +32,24 @@ def true_map(data, every, T_new_world=None):
 
 def surfaces(data, low, high, step=0.02):
     """Return (N, 2) points of the room's surfaces between two heights, seen from above."""
-    r = recorded(data).world.scene.rectangles
     parts = []
-    for k in range(len(r)):
-        corner, u, v = (r.frames[k, n : n + 3] for n in (0, 3, 6))
-        sides = (np.arange(0.0, size + step, step).clip(0, size) for size in r.faces[k, :2])
+    for corner, u, v, sizes in rectangles(recorded(data).world):
+        sides = (np.arange(0.0, size + step, step).clip(0, size) for size in sizes)
         s, t = (grid.reshape(-1, 1) for grid in np.meshgrid(*sides))
         points = corner + s * u + t * v
         parts.append(points[(points[:, 2] >= low) & (points[:, 2] <= high), :2])
     return np.concatenate(parts)
+
+
+def rectangles(world):
+    """Yield corner, sides and lengths of the rectangles of a world with or without pictures."""
+    if hasattr(world, "solids"):
+        for p in world.solids.shapes:
+            axes = p[[0, 1, 2, 4, 5, 6, 8, 9, 10]].reshape(3, 3)
+            yield p[[3, 7, 11]] @ axes, axes[1], axes[2], p[12:]
+        return
+    for f, face in zip(world.scene.rectangles.frames, world.scene.rectangles.faces, strict=True):
+        yield f[:3], f[3:6], f[6:], face[:2]
 
 
 def occupied(grid):

@@ -97,7 +97,7 @@ def test_no_return_is_free_only_where_that_is_asked_for():
 def test_a_grid_of_sweeps_shows_what_stands_between_two_heights(sweeps):
     made = grid_of_map(sweeps, recorded(SWEEPS).rig)
     assert made.made_of == "clouds"
-    assert made.notes == ("the floor is 1.39 m below the sensor, by what was seen",)
+    assert made.notes == ("the floor is 1.37 m below the sensor, by what was seen",)
     true = gridworlds.surfaces(SWEEPS, 0.1, 1.8)
     centres = occupied(made.grid)
     away = gridworlds.distances(centres, true)

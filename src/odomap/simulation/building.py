@@ -12,6 +12,7 @@ loop-closure detection using bags of visual words", T-RO 24(5), 2008 (perceptual
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,10 @@ from odomap.simulation.ring import Ring
 from odomap.simulation.room import R_CARRIER_IMU
 from odomap.simulation.scene import Scene, SceneBuilder
 
-__all__ = ["building", "corridor"]
+__all__ = ["building", "corridor", "furnished_building"]
 
 Array = NDArray[np.float64]
+Builder = TypeVar("Builder", bound=SceneBuilder)
 UP = np.array([0.0, 0.0, 1.0])
 ROUND_M, BAY_M, HALF_WIDTH, HEIGHT, DEEP = 60.0, 3.0, 1.25, 2.7, 3.0
 EYES_M = 1.5
@@ -73,15 +75,24 @@ def building(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]
     Returns:
         The scene, and the path of the body; the floor is z = 0, metres.
     """
+    builder, path = furnished_building(seed, moving_objects, speed, SceneBuilder)
+    return builder.build(), path
+
+
+def furnished_building(
+    seed: int, moving_objects: int, speed: float, make: type[Builder]
+) -> tuple[Builder, Path]:
+    """Return what a building is made of, collected by a builder of some type; as `building`."""
     rng = np.random.default_rng([seed, 3])
     length = float(rng.uniform(17.0, 20.0))
-    return _made(rng, length, 40, moving_objects, speed, is_alike=False)
+    return _made(rng, length, 40, moving_objects, speed, make, is_alike=False)
 
 
 def corridor(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     """Make a long corridor of identical doors, and walk round; as `building`."""
     rng = np.random.default_rng([seed, 4])
-    return _made(rng, 24.0, 2, moving_objects, speed, is_alike=True)
+    builder, path = _made(rng, 24.0, 2, moving_objects, speed, SceneBuilder, is_alike=True)
+    return builder.build(), path
 
 
 def _made(
@@ -90,8 +101,9 @@ def _made(
     posters: int,
     moving_objects: int,
     speed: float,
+    make: type[Builder],
     is_alike: bool,
-) -> tuple[Scene, Path]:
+) -> tuple[Builder, Path]:
     """Build walls round a ring `length` m long and 60 m round, and walk it."""
     radius = HALF_WIDTH
     width = ROUND_M / 2 - length + (4 - np.pi) * radius
@@ -99,7 +111,7 @@ def _made(
     lamps = np.array([ring.at(a, 0.0, HEIGHT - 0.3)[0] for a in np.arange(1.0, ROUND_M, 4.0)])
     powers = np.full(len(lamps), 1.6) if is_alike else rng.uniform(1.0, 2.4, len(lamps))
     lights = Lights(0.6, 1.2, lamps, powers, grid_m=0.3, open_rays=4)
-    builder = SceneBuilder(rng, lights, (0.9, 0.9))
+    builder = make(rng, lights, (0.9, 0.9))
     paints = _Paints(builder, posters)
     _floor_and_ceiling(builder, paints, ring, lamps)
     for bay in _bays(ring, outside=False):
@@ -111,7 +123,7 @@ def _made(
     way = ring.way(0.0, EYES_M, 0.75)
     way[:, 2] += rng.uniform(-0.05, 0.05)
     way = way if rng.random() < 0.5 else way[::-1]
-    return builder.build(), hand_held(way, speed, rng, R_CARRIER_IMU)
+    return builder, hand_held(way, speed, rng, R_CARRIER_IMU)
 
 
 def _bays(ring: Ring, outside: bool) -> list[_Bay]:

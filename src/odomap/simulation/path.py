@@ -5,9 +5,10 @@ points, with the phase σ(t) running at an uneven speed, and sways about it:
 
     x(t) = p(σ(t)) + Σ aₖ sin(ωₖ t + φₖ),     ẋ = p′σ̇ + …,     ẍ = p″σ̇² + p′σ̈ + …
 
-Its heading is that of the route, atan2(p′_y, p′_x), plus sinusoids; pitch and roll are sinusoids:
-R = Rz(ψ) Ry(θ) Rx(φ). Since everything is a spline or a sine, all derivatives are analytic, so
-that an IMU made from them integrates back to the path to the last digit of the integrator.
+Its heading is that of the route, atan2(p′_y, p′_x), plus sinusoids; pitch and roll are sinusoids,
+and of what climbs with the road the pitch is that of the route, too: R = Rz(ψ) Ry(θ) Rx(φ). Since
+everything is a spline or a sine, all derivatives are analytic, so that an IMU made from them
+integrates back to the path to the last digit of the integrator.
 
 Cost: O(1) per time, vectorised over times.
 
@@ -94,6 +95,7 @@ class Path:
         tilt: three-dimensional, added to yaw, pitch and roll, radians.
         R_carrier_body: (3, 3); the carrier has x forward, y left and z up.
         start: phase at time 0.
+        climbs: whether it pitches up and down with the route.
     """
 
     route: BSpline
@@ -103,6 +105,7 @@ class Path:
     tilt: Harmonics
     R_carrier_body: Array = field(default_factory=lambda: np.eye(3))
     start: float = 0.0
+    climbs: bool = False
 
     def at(self, times: Array) -> Motion:
         """Return the exact motion at times (N,) in seconds."""
@@ -117,6 +120,13 @@ class Path:
         angles[:, 0] += np.arctan2(p1[:, 1], p1[:, 0])
         turning = (p1[:, 0] * p2[:, 1] - p1[:, 1] * p2[:, 0]) / (p1[:, 0] ** 2 + p1[:, 1] ** 2)
         rates[:, 0] += turning * rate[:, 0]
+        if self.climbs:
+            # θ = -atan(p′_z / g) with g = |p′_xy|: positive pitch is nose down.
+            g = np.hypot(p1[:, 0], p1[:, 1])
+            faster = (p1[:, 0] * p2[:, 0] + p1[:, 1] * p2[:, 1]) / g
+            climbing = (p2[:, 2] * g - p1[:, 2] * faster) / (g**2 + p1[:, 2] ** 2)
+            angles[:, 1] -= np.arctan2(p1[:, 2], g)
+            rates[:, 1] -= climbing * rate[:, 0]
         Ts = np.tile(np.eye(4), (len(t), 1, 1))
         Ts[:, :3, :3] = _rotation(angles) @ self.R_carrier_body
         Ts[:, :3, 3] = p + sway
@@ -187,7 +197,10 @@ def hand_held(points: Array, speed: float, rng: np.random.Generator, R_carrier_b
     )
 
 
-def vehicle(points: Array, speed: float, rng: np.random.Generator, R_carrier_body: Array) -> Path:
+def vehicle(
+    points: Array, speed: float, rng: np.random.Generator, R_carrier_body: Array, *,
+    start: float | None = None, climbs: bool = False,
+) -> Path:  # fmt: skip
     """Drive a route on springs: gentle roll and pitch, road shake, uneven speed.
 
     Args:
@@ -195,6 +208,8 @@ def vehicle(points: Array, speed: float, rng: np.random.Generator, R_carrier_bod
         speed: mean speed along it, m/s.
         rng: where the numbers come from.
         R_carrier_body: (3, 3) axes of the body in the carrier.
+        start: phase at time 0; default a random one.
+        climbs: whether it pitches up and down with the route.
     """
     round_m = float(np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1).sum())
     hertz = [0.05, 0.17, 1.1, 2.7]
@@ -215,5 +230,6 @@ def vehicle(points: Array, speed: float, rng: np.random.Generator, R_carrier_bod
             hertz,
         ),
         R_carrier_body,
-        float(rng.uniform()),
+        float(rng.uniform()) if start is None else start,
+        climbs,
     )

@@ -5,6 +5,8 @@ a corner detector finds little on the plaster and much on what hangs there. The 
 goes round between the furniture.
 """
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,9 +14,10 @@ from odomap.simulation.light import Lights
 from odomap.simulation.path import Harmonics, Path, closed_route, hand_held
 from odomap.simulation.scene import Scene, SceneBuilder
 
-__all__ = ["R_CARRIER_IMU", "room"]
+__all__ = ["R_CARRIER_IMU", "furnished_room", "room"]
 
 Array = NDArray[np.float64]
+Builder = TypeVar("Builder", bound=SceneBuilder)
 
 R_CARRIER_IMU = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 """The IMU is mounted with x up, y right and z forward, as in many hand-held units."""
@@ -31,20 +34,28 @@ def room(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     Returns:
         The scene, and the path of the body; the floor is z = 0, metres.
     """
+    builder, path = furnished_room(seed, moving_objects, speed, SceneBuilder)
+    return builder.build(), path
+
+
+def furnished_room(
+    seed: int, moving_objects: int, speed: float, make: type[Builder]
+) -> tuple[Builder, Path]:
+    """Return what a room is made of, collected by a builder of some type; as `room`."""
     rng = np.random.default_rng([seed, 1])
     half = np.array([rng.uniform(3.2, 4.6), rng.uniform(2.6, 3.6)])
     height = float(rng.uniform(2.6, 3.1))
     lamps = np.column_stack([rng.uniform(-0.6, 0.6, (3, 2)) * half, np.full(3, height - 0.25)])
     lamps[2] = [0.0, 0.0, height - 0.5]
     lights = Lights(0.75, 1.2, lamps, rng.uniform(1.6, 4.0, 3), grid_m=0.16)
-    builder = SceneBuilder(rng, lights, (0.9, 0.9))
+    builder = make(rng, lights, (0.9, 0.9))
     _shell(builder, half, height)
     _hangings(builder, half, height)
     _furniture(builder, half)
     radii = half - 1.35
     for _ in range(moving_objects):
         _wanderer(builder, radii)
-    return builder.build(), _walk(rng, radii, speed)
+    return builder, _walk(rng, radii, speed)
 
 
 def _shell(builder: SceneBuilder, half: Array, height: float) -> None:

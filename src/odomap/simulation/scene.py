@@ -20,7 +20,7 @@ from odomap.simulation.path import Path
 from odomap.simulation.rays import BoxTree
 from odomap.simulation.texture import Atlas, texture
 
-__all__ = ["Rectangles", "Scene", "SceneBuilder"]
+__all__ = ["BareBuilder", "Rectangles", "Scene", "SceneBuilder"]
 
 Array = NDArray[np.float64]
 
@@ -218,17 +218,26 @@ class SceneBuilder:
                 mover=mover,
             )
 
-    def build(self) -> Scene:
-        """Bake the light and freeze the scene."""
-        n = len(self._frames)
-        codes = np.zeros((n, 4), np.int64)
+    @property
+    def movers(self) -> tuple[Path, ...]:
+        """Return the path of each moving object."""
+        return tuple(self._paths)
+
+    def rectangles(self) -> Rectangles:
+        """Return what was collected, without light."""
+        codes = np.zeros((len(self._frames), 4), np.int64)
         codes[:, 0] = self._textures
-        rectangles = Rectangles(
+        return Rectangles(
             np.array(self._frames),
             np.array(self._faces),
             codes,
             np.array(self._mover, np.int64),
         )
+
+    def build(self) -> Scene:
+        """Bake the light and freeze the scene."""
+        rectangles = self.rectangles()
+        codes = rectangles.codes
         tree = self._tree(rectangles)
         start = replace(rectangles, frames=self._frames_at_start(rectangles))
         light = bake(start.frames, start.faces, rectangles.mover, tree, self.lights, self.rng)
@@ -247,3 +256,23 @@ class SceneBuilder:
             rows = rectangles.mover == k
             frames[rows] = _transformed(path.at(np.zeros(1)).Ts_world_body[0], frames[rows])
         return frames
+
+
+class BareBuilder(SceneBuilder):
+    """Collects surfaces that no camera looks at: nothing is painted, which is what takes long.
+
+    The same seed furnishes otherwise than with paint, since painting draws numbers, too.
+
+    Attributes:
+        materials: kind of each texture.
+    """
+
+    def __init__(self, rng: np.random.Generator, lights: Lights, sky: tuple[float, float]) -> None:
+        super().__init__(rng, lights, sky)
+        self.materials: list[str] = []
+
+    def paint(self, kind: str, width: int = 512, height: int = 512) -> int:
+        """Remember what a texture would show and return its number."""
+        self.materials.append(kind)
+        self._images.append(np.broadcast_to(np.zeros((), np.float32), (height, width)))
+        return len(self._images) - 1

@@ -9,7 +9,9 @@ A world is given by a `WorldSpec`, by a name such as ``sim:room?seed=3&frames=10
     frames: 200
 
 With `sensors=laser` it is a floor plan driven through by a robot with a 2D laser and wheels, and no
-images: ``sim:building?sensors=laser&seed=3&rounds=2`` (see `simulation.laserworld`).
+images: ``sim:building?sensors=laser&seed=3&rounds=2`` (see `simulation.laserworld`). With
+`sensors=lidar3d` alone it holds sweeps of a 3D LiDAR, and no images either:
+``sim:street?sensors=lidar3d&beams=64&pattern=solid_state`` (see `simulation.sweepworld`).
 """
 
 import dataclasses
@@ -25,6 +27,7 @@ from odomap.errors import ConfigError, InputError, OdomapError, nearest_name
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.simulation.laserworld import LaserSpec, LaserWorld
+from odomap.simulation.sweepworld import SweepSpec, SweepWorld
 from odomap.simulation.world import World, WorldSpec
 from odomap.sources.source import Skipped
 
@@ -32,6 +35,8 @@ __all__ = ["SimulatedSource", "is_simulated", "read_spec"]
 
 PREFIX = "sim:"
 VERSION_FIELD = "odomap_world"
+
+Spec = WorldSpec | LaserSpec | SweepSpec
 
 
 def is_simulated(data: str | Path) -> bool:
@@ -44,8 +49,8 @@ def is_simulated(data: str | Path) -> bool:
     return path.name.endswith("world.yaml") and path.is_file()
 
 
-def read_spec(data: str | Path) -> WorldSpec | LaserSpec:
-    """Read what decides a world from a name or a file; one for a laser where sensors says so.
+def read_spec(data: str | Path) -> Spec:
+    """Read what decides a world from a name or a file; one for a LiDAR where sensors says so.
 
     Args:
         data: ``sim:KIND?field=value&...``, a `world.yaml`, or a folder that holds one.
@@ -88,10 +93,15 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _spec(where: str, given: Mapping[str, Any]) -> WorldSpec | LaserSpec:
+def _spec(where: str, given: Mapping[str, Any]) -> Spec:
     sensors = given.get("sensors", ())
     asked = sensors.split(",") if _is_text(sensors) else sensors
-    kind = LaserSpec if isinstance(asked, Iterable) and "laser" in asked else WorldSpec
+    asked = tuple(asked) if isinstance(asked, Iterable) else ()
+    kind: type[Spec] = WorldSpec
+    if "laser" in asked:
+        kind = LaserSpec
+    elif asked == ("lidar3d",):
+        kind = SweepSpec
     known = {f.name: f.default for f in dataclasses.fields(kind)}
     values: dict[str, Any] = {}
     for name, value in given.items():
@@ -149,7 +159,8 @@ class SimulatedSource:
         world: what decides it, a name, or a path to its `world.yaml`.
 
     Attributes:
-        world: what is measured; one for a laser has the true plan and the true ranges, too.
+        world: what is measured; one for a laser has the true plan and the true ranges, too, one for
+            a 3D LiDAR knows what every point shows.
         odometry: (N, 4, 4) what the wheels say, of a world for a laser; else None.
 
     Example:
@@ -158,15 +169,18 @@ class SimulatedSource:
         [0, 1]
     """
 
-    def __init__(self, world: WorldSpec | LaserSpec | str | Path) -> None:
+    def __init__(self, world: Spec | str | Path) -> None:
         spec = read_spec(world) if isinstance(world, str | Path) else world
-        self.world: World | LaserWorld
+        self.world: World | LaserWorld | SweepWorld
         self.odometry: NDArray[np.float64] | None = None
         self.name = f"sim:{spec.kind}?seed={spec.seed}&frames={spec.frames}"
         if isinstance(spec, LaserSpec):
             self.world = LaserWorld(spec)
             self.odometry = self.world.odometry
             self.name = f"sim:{spec.kind}?sensors=laser&seed={spec.seed}&frames={len(self.world)}"
+        elif isinstance(spec, SweepSpec):
+            self.world = SweepWorld(spec)
+            self.name = f"sim:{spec.kind}?sensors=lidar3d&seed={spec.seed}&frames={len(self.world)}"
         else:
             self.world = World(spec)
         self.rig = self.world.rig

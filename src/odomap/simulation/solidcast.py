@@ -1,0 +1,331 @@
+"""Sweeps of beams against solids: the nearest hit of each, and what surface it is.
+
+A sweep is S steps of B beams; all beams of a step leave T_world_lidar(t) together. A beam o + t d
+meets a rectangle where its plane is, t = (n·c - n·o)/n·d, if there 0 <= u·x - u·c <= a and the same
+of v; a cylinder where |o + t d - axis| = r; a ball of leaves a random length behind where the beam
+enters. The ground is followed from above: no slope is steeper than L, so that from a height f
+
+    t ← t + f / (|d_xy| L - d_z)
+
+over it never goes through, and where beams are steeper than the ground Newton's steps,
+f / (g·d_xy - d_z), end at its one root. What bounds the search is met first: the ground, then what
+the same beam met in the step before, so that most of the tree is never entered.
+
+Cost: about 0.2 µs a beam in a town of 5,000 shapes.
+
+Paper: A. Williams, S. Barrus, R. K. Morley, P. Shirley, "An efficient and robust ray-box
+intersection algorithm", Journal of Graphics Tools 10(1), 2005.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.kernels import kernel
+from odomap.simulation.solids import CYLINDER, RECTANGLE, Ground, Solids
+
+__all__ = ["GROUND", "NOTHING", "cast", "warm_up"]
+
+Array = NDArray[np.float64]
+F32 = NDArray[np.float32]
+Index = NDArray[np.int64]
+Ids = NDArray[np.int32]
+
+NOTHING, GROUND = -1, -2
+"""Whom a beam met that met no shape."""
+DEPTH = 64
+BELOW = -1e9
+"""Height of the ground where there is none."""
+
+
+def cast(
+    solids: Solids, Ts_world_lidar: Array, delays: Array, directions: Array, chances: F32,
+    time: float, farthest: float,
+) -> tuple[Array, Ids, Array]:  # fmt: skip
+    """Cast a sweep.
+
+    Args:
+        solids: what is there.
+        Ts_world_lidar: (S, 4, 4) at each step.
+        delays: (S,) of the steps since `time`, seconds.
+        directions: (S, B, 3) of the beams in the LiDAR, unit length.
+        chances: (S, B) from 0 to 1, which decide how far beams go into leaves.
+        time: of the beginning, seconds; movers go on straight from where they are then.
+        farthest: beyond nothing returns, metres.
+
+    Returns:
+        (S, B) distances, whom each met: a row of the shapes, GROUND or NOTHING, and (S, B, 3) the
+        normals of the surfaces in the world, towards the LiDAR, NaN where there is none.
+    """
+    shapes = solids.at(time)
+    spheres, velocities, first = _bounds(solids, shapes, Ts_world_lidar[0, :3, 3], time, farthest)
+    shape = directions.shape[:2]
+    distance, hit = np.empty(shape), np.empty(shape, np.int32)
+    normals = np.empty((*shape, 3))
+    ground = solids.ground
+    _cast_kernel(
+        np.ascontiguousarray(Ts_world_lidar), delays, directions, chances, farthest, shapes,
+        solids.forms, solids.boxes, solids.nodes, spheres, velocities, first, ground.heights,
+        ground.corner, ground.steepest, distance, hit, normals,
+    )  # fmt: skip
+    return distance, hit, normals
+
+
+def _bounds(
+    solids: Solids, shapes: Array, eye: Array, time: float, farthest: float
+) -> tuple[Array, Array, Index]:
+    """Return the movers within reach: spheres (K, 4), velocities (K, 3), first and last shape."""
+    spheres, velocities, first = [], [], []
+    for k, path in enumerate(solids.movers):
+        motion = path.at(np.array([time]))
+        middle, velocity = motion.Ts_world_body[0, :3, 3], motion.v_world_body[0]
+        rows = solids.num_still + np.searchsorted(solids.mover, [k, k + 1])
+        part = shapes[rows[0] : rows[1]]
+        # Corners c, c + a u, c + b v, c + a u + b v, of which n, u, v know the coordinates.
+        radius = 0.0
+        axes = part[:, [0, 1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 3)
+        for s in (0.0, 1.0):
+            for t in (0.0, 1.0):
+                along = part[:, [3, 7, 11]] + np.column_stack(
+                    [np.zeros(len(part)), s * part[:, 12], t * part[:, 13]]
+                )
+                corners = np.einsum("nij,ni->nj", axes, along)
+                radius = max(radius, float(np.linalg.norm(corners - middle, axis=1).max()))
+        if np.linalg.norm(middle - eye) - radius > farthest + 5.0:
+            continue
+        spheres.append([*middle, radius])
+        velocities.append(velocity)
+        first.append(rows)
+    return (
+        np.array(spheres).reshape(-1, 4),
+        np.array(velocities).reshape(-1, 3),
+        np.array(first, np.int64).reshape(-1, 2),
+    )
+
+
+@kernel
+def _meet(
+    p: Array, form: int, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float,
+    chance: float, best: float,
+) -> float:  # fmt: skip
+    """Return where o + t d meets shape i if at 1e-6 < t < best, else best."""
+    if form == RECTANGLE:
+        t: float = (p[i, 3] - p[i, 0] * ox - p[i, 1] * oy - p[i, 2] * oz) / (
+            p[i, 0] * dx + p[i, 1] * dy + p[i, 2] * dz
+        )
+        if not (t > 1e-6 and t < best):
+            return best
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        s = p[i, 4] * x + p[i, 5] * y + p[i, 6] * z - p[i, 7]
+        if s < 0.0 or s > p[i, 12]:
+            return best
+        s = p[i, 8] * x + p[i, 9] * y + p[i, 10] * z - p[i, 11]
+        return best if s < 0.0 or s > p[i, 13] else t
+    if form == CYLINDER:
+        x, y = ox - p[i, 0], oy - p[i, 1]
+        a, b = dx * dx + dy * dy, x * dx + y * dy
+        under = b * b - a * (x * x + y * y - p[i, 2] * p[i, 2])
+        if not under > 0.0:
+            return best
+        t = (-b - np.sqrt(under)) / a
+        if not (t > 1e-6 and t < best):
+            return best
+        z = oz + t * dz
+        return best if z < p[i, 3] or z > p[i, 4] else t
+    x, y, z = ox - p[i, 0], oy - p[i, 1], oz - p[i, 2]
+    b = x * dx + y * dy + z * dz
+    under = b * b - x * x - y * y - z * z + p[i, 3] * p[i, 3]
+    if not under > 0.0:
+        return best
+    root = np.sqrt(under)
+    # Every ball has a chance of its own: the beam's, shifted by the golden ratio.
+    chance = (chance + 0.6180339887 * i) % 1.0
+    t = max(-b - root, 0.0) - p[i, 4] * np.log(1.0 - 0.999999 * chance)
+    return t if t < -b + root and t > 1e-6 and t < best else best
+
+
+@kernel
+def _height(
+    h: Array, x0: float, y0: float, per: float, x: float, y: float
+) -> tuple[float, float, float]:
+    """Return h(x, y) and its slopes; BELOW where there is no ground."""
+    u, v = (x - x0) * per, (y - y0) * per
+    if not (u >= 0.0 and v >= 0.0 and u < h.shape[1] - 1 and v < h.shape[0] - 1):
+        return BELOW, 0.0, 0.0
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    low, high = h[j, i], h[j + 1, i]
+    low_step, high_step = h[j, i + 1] - low, h[j + 1, i + 1] - high
+    low, high = low + a * low_step, high + a * high_step
+    value: float = low + b * (high - low)
+    return value, per * (low_step + b * (high_step - low_step)), per * (high - low)
+
+
+@kernel
+def _follow(
+    h: Array, corner: Array, steepest: float, ox: float, oy: float, oz: float, dx: float,
+    dy: float, dz: float, best: float,
+) -> float:  # fmt: skip
+    """Return where o + t d first meets the ground if at t < best, else best."""
+    closing = steepest * np.sqrt(dx * dx + dy * dy) - dz
+    if closing <= 1e-9 or h.shape[0] < 2:
+        return best
+    x0, y0, per = corner[0], corner[1], 1.0 / corner[2]
+    is_steep = -dz > 1.5 * steepest
+    t = 0.0
+    for _ in range(200):
+        z, zx, zy = _height(h, x0, y0, per, ox + t * dx, oy + t * dy)
+        f = oz + t * dz - z
+        if abs(f) < 1e-9:
+            return t
+        rate = zx * dx + zy * dy - dz
+        if rate > 0.0 and z > BELOW and (is_steep or f < 1e-3):
+            t += f / rate
+        else:
+            t += f / closing
+        if not (t < best and t > 0.0):
+            return best
+    return t
+
+
+@kernel
+def _enters(
+    box: Array, i: int, k: int, ox: float, oy: float, oz: float, ix: float, iy: float, iz: float,
+    best: float,
+) -> float:  # fmt: skip
+    """Return where o + t d, with 1/d = (ix, iy, iz), enters a box; infinity if not before best."""
+    ax, bx = (box[i, k] - ox) * ix, (box[i, k + 3] - ox) * ix
+    ay, by = (box[i, k + 1] - oy) * iy, (box[i, k + 4] - oy) * iy
+    az, bz = (box[i, k + 2] - oz) * iz, (box[i, k + 5] - oz) * iz
+    enter = max(min(ax, bx), min(ay, by), min(az, bz), 0.0)
+    leave = min(max(ax, bx), max(ay, by), max(az, bz), best)
+    return enter if enter <= leave else np.inf
+
+
+@kernel
+def _through_tree(
+    shapes: Array, forms: Index, boxes: Array, nodes: Index, stack: Index, enters: Array,
+    o: tuple[float, float, float], d: tuple[float, float, float], chance: float, best: float,
+    who: int,
+) -> tuple[float, int]:  # fmt: skip
+    """Return where a beam first meets what stands still, and whom; best and who if not before."""
+    ox, oy, oz = o
+    dx, dy, dz = d
+    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
+    stack[0], enters[0] = 0, 0.0
+    top = 1
+    while top > 0:
+        top -= 1
+        if enters[top] >= best:
+            continue
+        node = stack[top]
+        ta = _enters(boxes, node, 0, ox, oy, oz, ix, iy, iz, best)
+        tb = _enters(boxes, node, 6, ox, oy, oz, ix, iy, iz, best)
+        # The nearer child first: a leaf is searched at once, an inner node goes on the stack last.
+        first = 0 if ta <= tb else 2
+        for turn in range(2):
+            side = first if turn == 0 else 2 - first
+            if (ta if side == 0 else tb) < best and nodes[node, side] < 0:
+                begin = -1 - nodes[node, side]
+                for k in range(begin, begin + nodes[node, side + 1]):
+                    t = _meet(shapes, forms[k], k, ox, oy, oz, dx, dy, dz, chance, best)
+                    if t < best:
+                        best, who = t, k
+        for turn in range(2):
+            side = 2 - first if turn == 0 else first
+            enter = ta if side == 0 else tb
+            if enter < best and nodes[node, side] >= 0:
+                stack[top], enters[top] = nodes[node, side], enter
+                top += 1
+    return best, who
+
+
+@kernel
+def _among_movers(
+    shapes: Array, forms: Index, spheres: Array, velocities: Array, first: Index, delay: float,
+    o: tuple[float, float, float], d: tuple[float, float, float], best: float, who: int,
+) -> tuple[float, int]:  # fmt: skip
+    """Return where a beam first meets what moves, and whom; best and who if not before."""
+    dx, dy, dz = d
+    for k in range(spheres.shape[0]):
+        ox = o[0] - velocities[k, 0] * delay
+        oy = o[1] - velocities[k, 1] * delay
+        oz = o[2] - velocities[k, 2] * delay
+        x, y, z = ox - spheres[k, 0], oy - spheres[k, 1], oz - spheres[k, 2]
+        b = x * dx + y * dy + z * dz
+        beyond = x * x + y * y + z * z - spheres[k, 3] * spheres[k, 3]
+        if b * b < beyond or (beyond > 0.0 and b > 0.0):
+            continue
+        for i in range(first[k, 0], first[k, 1]):
+            t = _meet(shapes, forms[i], i, ox, oy, oz, dx, dy, dz, 0.0, best)
+            if t < best:
+                best, who = t, i
+    return best, who
+
+
+@kernel
+def _cast_kernel(
+    Ts: Array, delays: Array, directions: Array, chances: F32, farthest: float, shapes: Array,
+    forms: Index, boxes: Array, nodes: Index, spheres: Array, velocities: Array, first: Index,
+    heights: Array, corner: Array, steepest: float, distance: Array, hit: Ids, normals: Array,
+) -> None:  # fmt: skip
+    """Write the nearest hit of every beam T d: distance, whom, and the normal there."""
+    stack, enters = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    num_still = shapes.shape[0]
+    if first.shape[0] > 0:
+        num_still = first[0, 0]
+    for s in range(directions.shape[0]):
+        T = Ts[s]
+        o = (T[0, 3], T[1, 3], T[2, 3])
+        for b in range(directions.shape[1]):
+            x, y, z = directions[s, b, 0], directions[s, b, 1], directions[s, b, 2]
+            dx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
+            dy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
+            dz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+            d = (dx, dy, dz)
+            chance: float = chances[s, b]
+            who = NOTHING
+            best = _follow(heights, corner, steepest, o[0], o[1], o[2], dx, dy, dz, farthest)
+            if best < farthest:
+                who = GROUND
+            if s > 0:
+                last = hit[s - 1, b]
+                if 0 <= last < num_still:
+                    t = _meet(shapes, forms[last], last, o[0], o[1], o[2], dx, dy, dz, chance, best)
+                    if t < best:
+                        best, who = t, last
+            best, who = _among_movers(
+                shapes, forms, spheres, velocities, first, delays[s], o, d, best, who
+            )
+            best, who = _through_tree(
+                shapes, forms, boxes, nodes, stack, enters, o, d, chance, best, who
+            )
+            distance[s, b], hit[s, b] = best, who
+            normals[s, b, 0], normals[s, b, 1], normals[s, b, 2] = np.nan, np.nan, np.nan
+            if who == GROUND:
+                _, zx, zy = _height(
+                    heights, corner[0], corner[1], 1.0 / corner[2], o[0] + best * dx,
+                    o[1] + best * dy,
+                )  # fmt: skip
+                long = np.sqrt(1.0 + zx * zx + zy * zy)
+                normals[s, b, 0], normals[s, b, 1] = -zx / long, -zy / long
+                normals[s, b, 2] = 1.0 / long
+            elif who >= 0 and forms[who] == RECTANGLE:
+                n = shapes[who]
+                sign = -1.0 if n[0] * dx + n[1] * dy + n[2] * dz > 0.0 else 1.0
+                for axis in range(3):
+                    normals[s, b, axis] = sign * n[axis]
+            elif who >= 0 and forms[who] == CYLINDER:
+                c = shapes[who]
+                normals[s, b, 0] = (o[0] + best * dx - c[0]) / c[2]
+                normals[s, b, 1] = (o[1] + best * dy - c[1]) / c[2]
+                normals[s, b, 2] = 0.0
+
+
+def warm_up() -> None:
+    """Compile the kernels of this file."""
+    from odomap.simulation.solids import SolidsBuilder
+
+    builder = SolidsBuilder(np.random.default_rng(0), Ground.none())
+    builder.box(np.array([3.0, 0, 0]), (1.0, 1.0, 1.0), "building")
+    beams = np.array([[[1.0, 1e-9, 1e-9]]])
+    cast(builder.build(), np.eye(4)[None], np.zeros(1), beams, np.zeros((1, 1), np.float32), 0.0, 9)

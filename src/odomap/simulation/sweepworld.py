@@ -1,0 +1,293 @@
+"""Worlds for a 3D LiDAR alone: solids, a path through them, sweeps, no images.
+
+Nothing is painted or lit, so a world is there within a second and a sweep of 16 x 1,800 beams takes
+a few milliseconds. Each point is measured at its own time along the path and given in the frame of
+that moment, as real sweeps are: a car at 8 m/s moves 0.8 m within one. As everywhere, the seed
+decides it to the last byte, and frames are made when they are asked for, in any order.
+
+What each point shows is known (`SweepWorld.sweep_truth`): the surface, its normal, whether it is
+ground, whether the beams beside it end on another one, so that labels can be judged.
+
+The body is the LiDAR.
+
+Reference: A. Dosovitskiy et al., "CARLA: an open urban driving simulator", CoRL 2017 (labels from
+simulated sweeps).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import ConfigError, nearest_name
+from odomap.geometry.trajectory import Trajectory
+from odomap.sensors.frame import Frame
+from odomap.sensors.rig import LidarMount, Rig
+from odomap.simulation.lidar import LidarNoise
+from odomap.simulation.path import Path
+from odomap.simulation.scanner import PATTERNS, Measured, Scanner, measure
+from odomap.simulation.solidcast import GROUND, NOTHING, cast
+from odomap.simulation.solidrooms import solid_building, solid_room
+from odomap.simulation.solids import ALBEDO, Solids
+from odomap.simulation.town import field, town, tunnel
+from odomap.simulation.world import START_NS
+
+__all__ = ["SweepSpec", "SweepWorld"]
+
+Array = NDArray[np.float64]
+
+MAKERS: Mapping[str, Callable[[int, int, float], tuple[Solids, Path]]] = MappingProxyType(
+    {
+        "street": town,
+        "room": solid_room,
+        "building": solid_building,
+        "tunnel": tunnel,
+        "field": field,
+    }
+)
+HAND_HELD = ("room", "building")
+NEAREST_M = 0.4
+COLUMNS = MappingProxyType({"rotating": 1800, "solid_state": 1500})
+INDOORS = (np.radians(-22.5), np.radians(22.5))
+"""View of a rotating LiDAR in rooms, so that floor and ceiling are seen."""
+
+
+@dataclass(frozen=True)
+class SweepSpec:
+    """What decides a world for a 3D LiDAR, to the last byte."""
+
+    kind: str = "street"
+    """"street" (a circuit of 500 to 650 m that rises and falls), "room", "building" (corridors and
+    rooms, 60 m round), both hand-held, "tunnel" (long and featureless) or "field" (flat ground and
+    nothing else)."""
+    seed: int = 0
+    """Which of the worlds of its kind."""
+    frames: int = 0
+    """How many sweeps there are; 0 for as many as the rounds take."""
+    rounds: float = 0.0
+    """How often one goes round, where frames do not say; 0 for 1.15, and in a tunnel for 0.35."""
+    rate_hz: float = 10.0
+    """Sweeps per second."""
+    speed: float = 0.0
+    """Mean speed in m/s; 0 for 0.6 in a room, 0.8 in a building and 7.5 outdoors."""
+    noise: float = 1.0
+    """Factor on all imperfections of the LiDAR; 0 for an ideal one."""
+    beams: int = 32
+    """Above each other, of which as many leave at once."""
+    columns: int = 0
+    """Steps of a sweep; 0 for 1800 of a rotating and 1500 of a solid-state LiDAR."""
+    pattern: str = "rotating"
+    """"rotating", or "solid_state": a rosette of 70 x 77 degrees ahead that never repeats."""
+    range_m: float = 100.0
+    """Beyond this nothing returns."""
+    moving_objects: int = 0
+    """How many cars (in a street), trolleys or cartons move; sixty cars are a fifth of the
+    points."""
+    sensors: tuple[str, ...] = ("lidar3d",)
+    """A 3D LiDAR, always."""
+
+    def __post_init__(self) -> None:
+        for name, known in (("kind", tuple(MAKERS)), ("pattern", PATTERNS)):
+            value = getattr(self, name)
+            if value not in known:
+                names = ", ".join(known)
+                raise ConfigError(
+                    f"{name}: '{value}' is none of {names}{nearest_name(value, known)}"
+                )
+        if self.sensors != ("lidar3d",):
+            raise ConfigError("sensors: a world for a LiDAR has 'lidar3d' alone")
+        for name, low, high in (("beams", 1, 256), ("columns", 0, 20_000)):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f"{name}: {getattr(self, name)} must be from {low} to {high}")
+        for name in ("seed", "frames", "moving_objects"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name}: {getattr(self, name)} must be 0 or more")
+        for name in ("rounds", "speed", "noise"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ConfigError(f"{name}: {value} must be finite and not negative")
+        for name in ("rate_hz", "range_m"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > (NEAREST_M if name == "range_m" else 0)):
+                raise ConfigError(f"{name}: {value} must be finite and above 0")
+
+    def completed(self) -> "SweepSpec":
+        """Return the spec with the values that depend on the kind filled in."""
+        walk = 0.6 if self.kind == "room" else 0.8
+        return replace(
+            self,
+            rounds=self.rounds or (0.35 if self.kind == "tunnel" else 1.15),
+            speed=self.speed or (walk if self.kind in HAND_HELD else 7.5),
+            columns=self.columns or COLUMNS[self.pattern],
+        )
+
+
+@dataclass(frozen=True)
+class SweepTruth:
+    """What the points of a sweep show, row by row.
+
+    Attributes:
+        points: (N, 3) without noise, in the LiDAR's frame at the moment of each.
+        surfaces: (N,) the surface: a row of the world's shapes, or -2 for the ground.
+        things: (N,) what it is a part of, such as one house or one car; 0 for the ground.
+        kinds: (N,) index of `solids.KINDS`.
+        normals: (N, 3) of the surface, towards the LiDAR, in its frame at the moment of each; NaN
+            of leaves.
+        is_ground: (N,) whether one could drive or walk on it.
+        is_edge: (N,) whether the surface ends beside the point, seen along its line of beams: it
+            stands before what is beside it, or bends there.
+        is_hidden: (N,) whether what ends beside the point is what stands before it: such an end is
+            no edge of anything, and moves with the LiDAR.
+    """
+
+    points: Array
+    surfaces: NDArray[np.int32]
+    things: NDArray[np.int64]
+    kinds: NDArray[np.int64]
+    normals: Array
+    is_ground: NDArray[np.bool_]
+    is_edge: NDArray[np.bool_]
+    is_hidden: NDArray[np.bool_]
+
+
+class SweepWorld:
+    """Solids seen by a moving LiDAR, with known truth.
+
+    Attributes:
+        spec: what decides it, completed, with the number of frames.
+        solids: what there is.
+        path: exact motion of the LiDAR; time 0 is the first frame's stamp.
+        rig: the LiDAR.
+        truth: (frames) exact T_world_body at the stamps, which are where sweeps begin.
+    """
+
+    def __init__(self, spec: SweepSpec) -> None:
+        spec = spec.completed()
+        self.solids, self.path = MAKERS[spec.kind](spec.seed, spec.moving_objects, spec.speed)
+        count = spec.frames or round(spec.rounds * spec.rate_hz / self.path.rounds_per_s) + 1
+        self.spec = replace(spec, frames=count)
+        is_rotating = spec.pattern == "rotating"
+        mount = LidarMount(
+            "top",
+            range_m=(NEAREST_M, spec.range_m),
+            rate_hz=spec.rate_hz,
+            sweep="clockwise" if is_rotating else "none",
+            beams=spec.beams if is_rotating else 0,
+        )
+        self.rig = Rig(lidars=(mount,))
+        view = INDOORS if spec.kind in HAND_HELD else (0.0, 0.0)
+        self._scanner = Scanner(spec.pattern, spec.beams, spec.columns, 1.0 / spec.rate_hz, view)
+        # Those of a rotating LiDAR are the same in every sweep.
+        self._directions = self._scanner.directions(0.0) if is_rotating else None
+        self._seconds = np.arange(count) / spec.rate_hz
+        stamps = START_NS + np.rint(self._seconds * 1e9).astype(np.int64)
+        self.truth = Trajectory(stamps, self.path.at(self._seconds).Ts_world_body)
+
+    def __len__(self) -> int:
+        return self.spec.frames
+
+    def frame(self, index: int) -> Frame:
+        """Take sweep `index`.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        measured, *_ = self._measured(index)
+        return Frame(
+            id=index,
+            stamp_ns=int(self.truth.stamps_ns[index]),
+            images=(),
+            cloud=measured.sweep,
+        )
+
+    def sweep_truth(self, index: int, reach: int = 2, bend_deg: float = 30.0) -> SweepTruth:
+        """Return what the points of sweep `index` show, in the order of its cloud.
+
+        Args:
+            index: of the frame.
+            reach: how many beams along the line (of the same beam number) an edge is felt.
+            bend_deg: surfaces that bend by less have no edge there.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        measured, directions, distance, hit, normals, R_world_lidar = self._measured(index)
+        edge, hidden = _edges(distance, hit, normals, reach, np.cos(np.radians(bend_deg)))
+        rows = measured.rows
+        who = hit.ravel()[rows]
+        local = np.einsum("sij,sbi->sbj", R_world_lidar, normals)
+        on = np.maximum(who, 0)
+        is_ground = who == GROUND
+        if len(self.solids):
+            kinds = np.where(is_ground, 0, self.solids.kinds[on])
+            things = np.where(is_ground, 0, self.solids.things[on])
+            is_ground = is_ground | self.solids.is_ground[on]
+        else:
+            kinds = things = np.zeros(len(who), np.int64)
+        return SweepTruth(
+            directions.reshape(-1, 3)[rows] * distance.ravel()[rows, None],
+            who,
+            things,
+            kinds,
+            local.reshape(-1, 3)[rows],
+            is_ground,
+            edge.ravel()[rows],
+            hidden.ravel()[rows],
+        )
+
+    def _measured(
+        self, index: int
+    ) -> tuple[Measured, Array, Array, NDArray[np.int32], Array, Array]:
+        """Return sweep `index`, and of all its beams what they truly met."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        time, delays = float(self._seconds[index]), self._scanner.delays
+        rng = np.random.default_rng([self.spec.seed, index, 67])
+        directions = self._directions
+        if directions is None:
+            directions = self._scanner.directions(time)
+        Ts = self.path.at(time + delays).Ts_world_body
+        chances = rng.random(directions.shape[:2], np.float32)
+        distance, hit, normals = cast(
+            self.solids, Ts, delays, directions, chances, time, self.spec.range_m
+        )
+        of_ground = np.float32(ALBEDO["ground"])
+        table = np.append(self.solids.albedos, [of_ground, np.float32(0.0)]).astype(np.float32)
+        R_world_lidar = np.ascontiguousarray(Ts[:, :3, :3])
+        # The last of the table are of hits -2 and -1: ground, nothing.
+        measured = measure(
+            directions, delays, R_world_lidar, distance, table[hit], normals, NEAREST_M,
+            LidarNoise().scaled(self.spec.noise), rng,
+        )  # fmt: skip
+        return measured, directions, distance, hit, normals, R_world_lidar
+
+
+def _edges(
+    distance: Array, hit: NDArray[np.int32], normals: Array, reach: int, bend: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return (S, B) whether a surface ends or bends beside a beam, and whether it is hidden there.
+
+    A jump is where the next beam along the line ends on another surface farther than the slope of
+    neither explains; the nearer side has the edge, the farther side is hidden.
+    """
+    edge, hidden = np.zeros(hit.shape, np.bool_), np.zeros(hit.shape, np.bool_)
+    other = hit[1:] != hit[:-1]
+    step = distance[1:] - distance[:-1]
+    nearer = np.minimum(distance[1:], distance[:-1])
+    # Where nothing returned the surface ends, too, but nobody knows at what.
+    jump = other & (np.abs(step) > 0.1 + 0.02 * nearer)
+    with np.errstate(invalid="ignore"):
+        cosine = (normals[1:] * normals[:-1]).sum(axis=2)
+        fold = other & ~jump & (cosine < bend)
+    for k in range(reach):
+        for before in (True, False):
+            # Beams k steps from the border, on the side before it or behind it.
+            rows = slice(0, len(step) - k) if before else slice(k + 1, None)
+            at = slice(k, None) if before else slice(0, len(step) - k)
+            has_edge = fold[at] | (jump[at] & ((step[at] > 0) == before))
+            same = hit[rows] == (hit[:-1] if before else hit[1:])[at]
+            edge[rows] |= has_edge & same
+            hidden[rows] |= jump[at] & ((step[at] > 0) != before) & same
+    return edge & (hit != NOTHING), hidden & (hit != NOTHING)
