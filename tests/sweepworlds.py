@@ -70,3 +70,69 @@ def compensated(points: Array, speed: float = 10.0, period: float = PERIOD) -> A
     """Return a sweep with the motion of a car taken out, as the odometry benchmark has them."""
     times = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) * period
     return points + np.outer(times, [speed, 0.0, 0.0])
+
+
+def lzf(data: bytes) -> bytes:
+    """Pack bytes as LZF does: three equal ones that stood before are repeated."""
+    out, literal, seen, at = bytearray(), bytearray(), {}, 0
+
+    def flush() -> None:
+        for k in range(0, len(literal), 32):
+            part = literal[k : k + 32]
+            out.extend([len(part) - 1, *part])
+        literal.clear()
+
+    while at < len(data):
+        key = data[at : at + 3]
+        before = seen.get(key, -1)
+        seen[key] = at
+        if len(key) == 3 and before >= 0 and at - before <= 8192:
+            count = 3
+            while count < 264 and data[at + count : at + count + 1] == (
+                data[before + count : before + count + 1] or b"?"
+            ) and at + count < len(data):  # fmt: skip
+                count += 1
+            flush()
+            back, long = at - before - 1, count - 2
+            first = min(long, 7)
+            out.append(first << 5 | back >> 8)
+            if first == 7:
+                out.append(long - 7)
+            out.append(back & 255)
+            at += count
+        else:
+            literal.append(data[at])
+            at += 1
+    flush()
+    return bytes(out)
+
+
+def pcd_bytes(columns: dict[str, NDArray[np.generic]], form: str) -> bytes:
+    """Return a PCD file of a form: "ascii", "binary", "binary_compressed"."""
+    count = len(next(iter(columns.values())))
+    kinds = [column.dtype for column in columns.values()]
+    lines = [
+        "# .PCD v0.7",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join(str(k.itemsize) for k in kinds)}",
+        f"TYPE {' '.join(k.kind.upper() for k in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        f"DATA {form}",
+    ]
+    head = ("\n".join(lines) + "\n").encode()
+    if form == "ascii":
+        rows = zip(*(column.tolist() for column in columns.values()))
+        return head + "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode()
+    if form == "binary":
+        rows = np.empty(count, [(name, column.dtype) for name, column in columns.items()])
+        for name, column in columns.items():
+            rows[name] = column
+        return head + rows.tobytes()
+    data = b"".join(column.tobytes() for column in columns.values())
+    packed = lzf(data)
+    return head + np.array([len(packed), len(data)], "<u4").tobytes() + packed

@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 from odomap.errors import InputError
 from odomap.files.atomic import atomic_binary
+from odomap.files.pointtable import PointTable, file_bytes
 from odomap.maps.surface import Surface
 
-__all__ = ["read_ply", "write_ply"]
+__all__ = ["read_ply", "read_ply_points", "write_ply"]
 
 _WORDS = (
     "char uchar short ushort int uint float double "
@@ -133,21 +134,37 @@ def read_ply(path: str | Path) -> Surface:
         InputError: no PLY, a header that cannot be, or a file that ends too early.
     """
     file = Path(path)
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
+    return _surface(file, _elements(file))
+
+
+def read_ply_points(path: str | Path) -> PointTable:
+    """Read all that a PLY says of its vertices: also intensities, times and beams.
+
+    Raises:
+        InputError: no PLY, a header that cannot be, or a file that ends too early.
+    """
+    file = Path(path)
+    vertex = _elements(file).get("vertex", {})
+    columns = {name: np.asarray(column) for name, column in vertex.items()}
+    columns = {name: column for name, column in columns.items() if column.ndim == 1}
+    if any(name not in columns for name in "xyz"):
+        raise InputError(f"{file}: has no vertices with x, y and z")
+    return PointTable(columns, len(columns["x"]))
+
+
+def _elements(file: Path) -> dict[str, Any]:
+    """Return the columns of each element of a file."""
+    data = file_bytes(file)
     order, elements, start = _parse_header(file, data)
+    if not order:
+        return _text_rows(file, elements, data[start:])
     found: dict[str, Any] = {}
-    if order:
-        body = memoryview(data)[start:]
-        for element in elements:
-            rows, used = _binary_rows(file, element, body, order)
-            body = body[used:]
-            found[element.name] = rows
-    else:
-        found = _text_rows(file, elements, data[start:])
-    return _surface(file, found)
+    body = memoryview(data)[start:]
+    for element in elements:
+        rows, used = _binary_rows(file, element, body, order)
+        body = body[used:]
+        found[element.name] = rows
+    return found
 
 
 def _parse_header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:

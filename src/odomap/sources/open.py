@@ -6,6 +6,7 @@ Recognised by what a folder holds, not by its name:
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
     KITTI velodyne    velodyne/*.bin, times.txt; or velodyne_points/data/*.bin
+    clouds            a folder of *.pcd, *.ply, *.las or *.npy, one per sweep; or one of these
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
     laser log         a file: CARMEN's (.clf, .log, also .bz2 or .gz), or Odometry and Laser lines
@@ -26,6 +27,7 @@ from odomap.sources.bagfile import is_bag
 from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.camera import PREFIX, CameraSource
 from odomap.sources.carmen import MESSAGES, CarmenSource
+from odomap.sources.cloudfolder import CloudSource, cloud_folder, is_cloud
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
@@ -42,7 +44,7 @@ __all__ = ["SUPPORTED", "open"]
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "KITTI velodyne (velodyne/*.bin), TUM RGB-D (rgb.txt, depth.txt), "
-    "videos (.mp4, .mov, .avi, .mkv, ...), "
+    "folders of clouds (.pcd, .ply, .las, .npy), videos (.mp4, .mov, .avi, .mkv, ...), "
     "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
     "bags of ROS 1 and 2 with laser scans (.bag, .mcap, .db3, or the folder of one), "
     "live cameras ('camera:0'), "
@@ -87,6 +89,9 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
         return _bag(file, rig, options)
     if is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
         return None
+    if is_cloud(file):
+        rig = rig_beside([file.with_name("rig.yaml")]) if rig is None else load_rig(rig)
+        return CloudSource(file, rig, options)
     words = set(beginnings(file))
     for kinds, kind in ((MESSAGES, CarmenSource), (WORDS, PlainLogSource)):
         if words & kinds:
@@ -110,7 +115,7 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
         raise InputError(_missing(root))
     if root.is_dir() and not is_kitti(root) and is_velodyne(root):
         return VelodyneSource(root, _rig(root, rig, calibrated=False), options)
-    if options and not is_bag(root):
+    if options and not is_bag(root) and not _holds_clouds(root):
         check_options(root, options, ())
     if root.is_file():
         if root.suffix.lower() in (".yaml", ".yml"):
@@ -130,6 +135,8 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
     if is_bag(root):
         return _bag(root, rig, options)
     calibration = given or rig_beside([root / "rig.yaml"])
+    if _holds_clouds(root):
+        return CloudSource(root, calibration, options)
     outside = next((p for p in list(root.resolve().parents)[:3] if _is_recording(p)), None)
     if outside is not None and calibration is None:
         raise InputError(f"{root}: is a part of a recording: open {outside}")
@@ -152,6 +159,10 @@ def _rig(root: Path, rig: Rig | str | Path | None, calibrated: bool | None = Non
 
 def _is_recording(path: Path) -> bool:
     return is_euroc(path) or is_kitti(path) or is_tum(path)
+
+
+def _holds_clouds(root: Path) -> bool:
+    return root.is_dir() and cloud_folder(root) is not None and not image_folders(root)
 
 
 def _simulated(spec: str, rig: Rig | str | Path | None) -> Source:
