@@ -1,0 +1,90 @@
+"""Settings of SLAM with a 3D LiDAR, in one place and without what they set.
+
+Reading them compiles nothing, so that the command line can show them at once. What they are for is
+told where they are used: `cloudclosing`, `cloudrecognition`, `cloudthinning`.
+"""
+
+from dataclasses import dataclass
+
+from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
+
+__all__ = ["CloudClosingConfig", "CloudThinningConfig"]
+
+
+@dataclass(frozen=True)
+class CloudClosingConfig:
+    """When loops are looked for, and believed."""
+
+    enabled: bool = True
+    """Whether places seen before are searched for."""
+    rings: Count = 20
+    """Rings around the sensor that a place is described by."""
+    sectors: Count = 36
+    """Sectors of a turn that it is described by."""
+    reach: Positive = 60.0
+    """How far it is described, metres."""
+    beside: NotNegative = 4.0
+    """How far to either side of where a place was seen it is recognised, metres."""
+    alike: Fraction = 0.4
+    """Largest distance of the descriptions of two places that may be one."""
+    most: Count = 2
+    """Places that a keyframe is laid onto."""
+    least_way: Positive = 25.0
+    """Way from a place after which one may come back to it, metres."""
+    apart: NotNegative = 6.0
+    """Way between two keyframes that are tied to earlier ones, metres."""
+    least_reach: Positive = 10.0
+    """How far from where the path says a place may be at least, metres."""
+    drift: Fraction = 0.03
+    """The same, of the way since then: odometry may have drifted more than it says."""
+    near: Positive = 6.0
+    """How near a place must be, as far as the path knows, to be tried whatever it looks like,
+    metres."""
+    neighbours: NotNegative = 10.0
+    """Keyframes so far along the path before and after a place are laid together there, metres."""
+    voxel: Positive = 0.6
+    """Side of the voxels in which clouds are laid onto each other, metres."""
+    max_distance: Positive = 2.0
+    """Farthest that points of the two may be apart then, metres."""
+    overlap: Fraction = 0.6
+    """Share of a cloud that must meet what is known."""
+    agree: Fraction = 0.15
+    """Share of what stands up in one sweep that the other must have seen, too."""
+    against: Fraction = 0.05
+    """Share of that which the other may have looked through, relative to both."""
+    solve_every: Count = 8
+    """Keyframes after which the path is solved anew if there are new loops; in large maps more."""
+    solve_share: Fraction = 0.02
+    """The same, relative to all keyframes."""
+    solve_off: Positive = 0.5
+    """How far off the path a new loop is for it to be solved at once, metres."""
+    doubt: Positive = 4.0
+    """Factor on all standard deviations while it is decided which loops are true."""
+    outlying: Positive = 10.0
+    """Standard deviations at which a loop counts half."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
+class CloudThinningConfig:
+    """When keyframes go that show nothing new."""
+
+    enabled: bool = True
+    """Whether any go: a map then grows with the space seen, and not with time."""
+    near: Positive = 8.0
+    """How near older keyframes must be that show what one shows, metres."""
+    covers: Count = 2
+    """How many of them must be so near."""
+    voxel: Positive = 0.8
+    """Side of the voxels in which clouds are compared, metres."""
+    within: Positive = 30.0
+    """How far a cloud is compared: beyond, points are few, and far apart; metres."""
+    share: Fraction = 0.9
+    """Share of a cloud's voxels that older ones must show for its keyframe to go."""
+    settled: Count = 20
+    """Newest keyframes that stay: the path through them is not settled yet."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)

@@ -1,0 +1,145 @@
+"""Verifying that two clouds are of one place, and measuring how they lie to each other.
+
+A candidate is a guess of where one LiDAR was in the frame of another. The cloud is laid onto the
+place there by GICP, and believed if all of this holds:
+
+    it comes to rest                                    else the guess was too far off
+    enough of it meets what is known                    else it is somewhere else
+    each saw what stands up in the other                else nothing speaks for it
+    and neither looked through it                       else the places only look the same
+
+The last is what tells: streets fit on streets, but not without walls where the other one looked
+through (`lidar/sightlines`). Roads agree everywhere, cars come and go: what stands up counts, where
+anything does. Registration takes errors for independent, and of thinned clouds they are not, so
+
+    Σ = 9 (I + I₀)⁻¹ + diag(0.03 m/m, 0.005 rad/m)² e²
+
+with e the root mean square distance of the points from the surface, and I₀ that of what nobody
+knows, 1 m and 0.1 rad, along a tunnel: of simulated streets 0.4 (32 beams) to 1.2 (16 beams) of it.
+
+Cost: 20 ms beside the place.
+
+Reference: A. Segal, D. Haehnel, S. Thrun, "Generalized-ICP", RSS 2009.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import InputError
+from odomap.geometry.lie import se3_adjoint, se3_inverse
+from odomap.lidar.cloud import Cloud
+from odomap.lidar.registration import Registration, register
+from odomap.lidar.sightlines import Panorama, Seen
+from odomap.lidar.target import Target
+from odomap.system.cloudconfig import CloudClosingConfig
+
+__all__ = ["Laid", "lay", "of_bodies", "stands_up"]
+
+Array = NDArray[np.float64]
+
+LOWEST, TALL, FEWEST = 0.05, 2.0, 200
+"""Share of the points that may be below the ground, height above it from which a thing stands up,
+metres, and points that there must be of them."""
+INFLATED = 9.0
+FLOOR = np.array([0.03] * 3 + [0.005] * 3)
+UNKNOWN = np.diag([1.0] * 3 + [0.1] * 3) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """How a cloud lies on a place.
+
+    Attributes:
+        T_place_lidar: (4, 4).
+        information: (6, 6) of that, right tangent.
+        num_inliers: points that meet what is known.
+        overlap: share of them.
+        doubt: the larger share of what stands up in one that the other looked through.
+        reason: why it is not believed; empty if it is.
+    """
+
+    T_place_lidar: Array
+    information: Array
+    num_inliers: int
+    overlap: float
+    doubt: float
+    reason: str
+
+
+def lay(
+    points: Array,
+    place: Target,
+    there: Array,
+    ups: tuple[Array, Array],
+    guess: Array,
+    config: CloudClosingConfig,
+) -> Laid:
+    """Lay a cloud onto a place, and judge whether it belongs there.
+
+    Args:
+        points: (N, 3) the cloud.
+        place: what is known there, in the frame of the LiDAR that saw it.
+        there: (M, 3) what that LiDAR saw in its sweep alone.
+        ups: (3,) which way is up in the cloud, and there.
+        guess: (4, 4) T_place_lidar.
+        config: what it must show.
+    """
+    try:
+        found = register(
+            Cloud.of(points),
+            place,
+            "gicp",
+            initial=guess,
+            voxel=config.voxel,
+            max_distance=config.max_distance,
+        )
+    except InputError as error:
+        return Laid(guess, np.zeros((6, 6)), 0, 0.0, 1.0, str(error))
+    T, overlap = found.T_target_source, found.num_inliers / found.num_points
+    seen = Panorama(there).judge(stands_up(points, ups[0]), T)
+    back = Panorama(points).judge(stands_up(there, ups[1]), se3_inverse(T))
+    doubt = max(seen.doubt, back.doubt)
+    reason = _reason(found, overlap, (seen, back), config)
+    return Laid(T, _information(found), found.num_inliers, overlap, doubt, reason)
+
+
+def _reason(
+    found: Registration, overlap: float, seen: tuple[Seen, Seen], config: CloudClosingConfig
+) -> str:
+    """Say why a cloud is not believed to belong to a place; nothing if it is."""
+    if not found.converged:
+        return found.reason
+    if overlap < config.overlap:
+        return f"{overlap:.0%} of {found.num_points} points meet what is known there"
+    agree, doubt = min(s.agree for s in seen), max(s.doubt for s in seen)
+    if agree < config.agree:
+        return f"{agree:.0%} of what stands there was seen by both"
+    if doubt > config.against:
+        return f"of what stands there {doubt:.0%} is where the other sweep looked through"
+    return ""
+
+
+def stands_up(points: Array, up: Array) -> Array:
+    """Return the points (n, 3) that stand up above the ground; all where hardly any do."""
+    heights = points @ up
+    lowest = int(LOWEST * len(heights))
+    ground = np.partition(heights, lowest)[lowest] if len(heights) else 0.0
+    tall = heights > ground + TALL
+    return points[tall] if tall.sum() >= FEWEST else points
+
+
+def _information(found: Registration) -> Array:
+    """Return the information (6, 6) of a pose, honest about errors that are not independent."""
+    known = np.linalg.inv(found.information + np.linalg.inv(UNKNOWN))
+    covariance = INFLATED * known + np.diag((FLOOR * found.error) ** 2)
+    information = np.linalg.inv(covariance)
+    return np.asarray(0.5 * (information + information.T))
+
+
+def of_bodies(T_a_b: Array, information: Array, T_body_lidar: Array) -> tuple[Array, Array]:
+    """Return how bodies lie, (4, 4), and the information (6, 6), of how their LiDARs do."""
+    back = se3_inverse(T_body_lidar)
+    Ad = se3_adjoint(back)
+    return T_body_lidar @ T_a_b @ back, Ad.T @ information @ Ad
