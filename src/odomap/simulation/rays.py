@@ -8,9 +8,14 @@ The rectangles hang in a binary tree split at the median of their centres along 
 ray visits the boxes it enters before its best hit so far, nearer child first. LiDAR beams, shadows
 and the sky light use it; cameras, whose rays are a grid, are rasterised instead (`render`).
 
+Trees for many more rays are split by surface area: a ray that enters a box enters a part of it in
+proportion to its area A, so that the split with the least A₁ n₁ + A₂ n₂ is the quickest. It takes a
+few times as long to build, and half as many boxes are entered.
+
 Cost: O(log N) per ray, O(N log N) to build.
 
-Paper: T. L. Kay and J. T. Kajiya, "Ray tracing complex scenes", SIGGRAPH 1986.
+Papers: T. L. Kay and J. T. Kajiya, "Ray tracing complex scenes", SIGGRAPH 1986; J. D. MacDonald, K.
+S. Booth, "Heuristics for ray tracing using space subdivision", The Visual Computer 6(3), 1990.
 """
 
 from dataclasses import dataclass
@@ -42,8 +47,13 @@ class BoxTree:
     order: NDArray[np.int64]
 
     @classmethod
-    def of(cls, corners: Array) -> "BoxTree":
-        """Build over rectangles given by their corners (N, 4, 3)."""
+    def of(cls, corners: Array, *, by_area: bool = False) -> "BoxTree":
+        """Build over rectangles given by their corners (N, 4, 3), or by any points they span.
+
+        Args:
+            corners: (N, K, 3) metres.
+            by_area: whether to split by surface area instead of at the median.
+        """
         low, high = corners.min(1) - 1e-9, corners.max(1) + 1e-9
         centre = 0.5 * (low + high)
         boxes: list[Array] = []
@@ -61,12 +71,35 @@ class BoxTree:
                 nodes.append([-1 - len(order), len(members)])
                 order.extend(members.tolist())
                 continue
-            axis = int(np.argmax(np.ptp(centre[members], axis=0)))
-            ranked = members[np.argsort(centre[members, axis], kind="stable")]
-            half = len(ranked) // 2
+            if by_area:
+                ranked, half = _by_area(members, low, high)
+            else:
+                axis = int(np.argmax(np.ptp(centre[members], axis=0)))
+                ranked = members[np.argsort(centre[members, axis], kind="stable")]
+                half = len(ranked) // 2
             todo += [(ranked[half:], len(nodes), 1), (ranked[:half], len(nodes), 0)]
             nodes.append([0, 0])
         return cls(np.array(boxes), np.array(nodes, np.int64), np.array(order, np.int64))
+
+
+def _by_area(members: NDArray[np.int64], low: Array, high: Array) -> tuple[NDArray[np.int64], int]:
+    """Return members in order along an axis, and how many of them go first: least A₁ n₁ + A₂ n₂."""
+    least, best, half = np.inf, members, len(members) // 2
+    count = np.arange(1, len(members))
+    for axis in range(3):
+        ranked = members[np.argsort(low[members, axis] + high[members, axis], kind="stable")]
+        lo, hi = low[ranked], high[ranked]
+        first = np.maximum.accumulate(hi) - np.minimum.accumulate(lo)
+        last = np.maximum.accumulate(hi[::-1]) - np.minimum.accumulate(lo[::-1])
+        areas = [
+            e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0]
+            for e in (first[:-1], last[::-1][1:])
+        ]
+        cost = areas[0] * count + areas[1] * count[::-1]
+        at = int(cost.argmin())
+        if cost[at] < least:
+            least, best, half = float(cost[at]), ranked, at + 1
+    return best, half
 
 
 @kernel

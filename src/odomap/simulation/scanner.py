@@ -10,8 +10,9 @@ a little above each other, and a line of points follows the curve, not a ring.
 
 What is measured is wrong as lasers are: noise n ~ N(0, σ(1 + r/50 m)), beams lost at random and
 more often at grazing incidence, and beams that touch a second surface beside the first return a
-range between both. A beam of half width β does so of a neighbour δ away in mixed · min(1, 0.4 β/δ)
-of all cases. The intensity is that of a dull surface, albedo · cosine of the incidence, times 255.
+range between both. A beam of half width β does so in mixed · min(1, 0.4 β/δ) of all cases where the
+next beam, δ away, meets another surface. The intensity is that of a dull surface, albedo · cosine
+of the incidence, times 255.
 
 Cost: 30 ns a beam.
 
@@ -32,6 +33,7 @@ __all__ = ["PATTERNS", "Scanner", "measure", "warm_up"]
 
 Array = NDArray[np.float64]
 F32 = NDArray[np.float32]
+Ids = NDArray[np.int32]
 
 PATTERNS = ("rotating", "solid_state")
 ELEVATIONS = ((16, -15.0, 15.0), (32, -30.0, 10.0), (64, -24.8, 2.0), (1024, -25.0, 15.0))
@@ -107,8 +109,8 @@ class Measured:
 
 
 def measure(
-    directions: Array, delays: Array, rays: Array, distance: Array, albedos: F32, normals: Array,
-    nearest: float, noise: LidarNoise, rng: np.random.Generator,
+    directions: Array, delays: Array, rays: Array, distance: Array, hit: Ids, albedos: F32,
+    normals: Array, nearest: float, noise: LidarNoise, rng: np.random.Generator,
 ) -> Measured:  # fmt: skip
     """Measure a sweep.
 
@@ -117,6 +119,7 @@ def measure(
         delays: (S,) of the steps, seconds.
         rays: (S, 3, 3) rotations R_world_lidar of the steps.
         distance: (S, B) true ones, metres.
+        hit: (S, B) which surface was met; below 0 and the same for none, or the ground.
         albedos: (S, B) of what was met; 0 where nothing was.
         normals: (S, B, 3) of what was met, in the world; NaN where it has none.
         nearest: what is nearer does not return, metres.
@@ -130,7 +133,7 @@ def measure(
     rows = np.empty(steps * beams, np.int64)
     wrong = np.array([noise.range_m, noise.dropout, noise.mixed, noise.divergence, nearest])
     count = _measure_kernel(
-        directions, rays, distance, albedos, normals, gauss, chances, wrong,
+        directions, rays, distance, hit, albedos, normals, gauss, chances, wrong,
         points, intensities, rows,
     )  # fmt: skip
     rows = rows[:count].copy()
@@ -147,33 +150,19 @@ def measure(
 
 
 @kernel
-def _beside(
-    directions: Array, distance: Array, albedos: F32, s: int, b: int, u: int, c: int, noise: Array
-) -> float:
-    """Return the chance that beam (s, b) touches what (u, c) met too: mixed · min(1, 0.4 β/δ)."""
-    if not (0 <= u < distance.shape[0] and 0 <= c < distance.shape[1]):
-        return 0.0
-    if abs(distance[u, c] - distance[s, b]) < 0.1 or albedos[u, c] <= 0.0:
-        return 0.0
-    square = 0.0
-    for axis in range(3):
-        square += (directions[s, b, axis] - directions[u, c, axis]) ** 2
-    chance: float = noise[2] * min(1.0, 0.4 * noise[3] / max(np.sqrt(square), 1e-9))
-    return chance
-
-
-@kernel
 def _measure_kernel(
-    directions: Array, rays: Array, distance: Array, albedos: F32, normals: Array, gauss: F32,
-    chances: F32, noise: Array, points: Array, intensities: F32, rows: NDArray[np.int64],
+    directions: Array, rays: Array, distance: Array, hit: Ids, albedos: F32, normals: Array,
+    gauss: F32, chances: F32, noise: Array, points: Array, intensities: F32,
+    rows: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Write what returns: r d with r = r₀ + σ(1 + r₀/50) n, 255 · albedo · cosine, and its row.
 
     noise: σ, share lost, share mixed, half width of a beam, nearest range. Returns how many.
     """
-    count = 0
-    for s in range(distance.shape[0]):
-        for b in range(distance.shape[1]):
+    count, most = 0, 4.0 * noise[2]
+    steps, beams = distance.shape
+    for s in range(steps):
+        for b in range(beams):
             if albedos[s, b] <= 0.0:
                 continue
             r = distance[s, b]
@@ -187,22 +176,28 @@ def _measure_kernel(
             lost = noise[1] * (5.0 if cosine < 0.1 else 1.0)
             if chances[0, s, b] < lost:
                 continue
-            if noise[2] > 0.0:
-                chance, left = float(chances[1, s, b]), 0.0
-                for side in range(4):
-                    u = s + (1 if side == 0 else -1 if side == 1 else 0)
-                    c = b + (1 if side == 2 else -1 if side == 3 else 0)
-                    touches = _beside(directions, distance, albedos, s, b, u, c, noise)
-                    if left <= chance < left + touches:
-                        weight = (chance - left) / touches
-                        r = weight * r + (1.0 - weight) * distance[u, c]
-                    left += touches
+            chance = chances[1, s, b]
+            for side in range(4 if chance < most else 0):
+                u = s + (1 if side == 0 else -1 if side == 1 else 0)
+                c = b + (1 if side == 2 else -1 if side == 3 else 0)
+                if u < 0 or c < 0 or u >= steps or c >= beams or hit[u, c] == hit[s, b]:
+                    continue
+                if albedos[u, c] <= 0.0 or abs(distance[u, c] - distance[s, b]) < 0.1:
+                    continue
+                square = 0.0
+                for axis in range(3):
+                    square += (directions[s, b, axis] - directions[u, c, axis]) ** 2
+                touches = noise[2] * min(1.0, 0.4 * noise[3] / max(np.sqrt(square), 1e-9))
+                if 0.0 <= chance < touches:
+                    weight = chance / touches
+                    r = weight * r + (1.0 - weight) * distance[u, c]
+                chance -= touches
             r += noise[0] * (1.0 + r / 50.0) * gauss[s, b]
             if r < noise[4]:
                 continue
             points[count, 0], points[count, 1], points[count, 2] = r * x, r * y, r * z
             intensities[count] = 255.0 * albedos[s, b] * cosine
-            rows[count] = s * distance.shape[1] + b
+            rows[count] = s * beams + b
             count += 1
     return count
 
@@ -211,6 +206,6 @@ def warm_up() -> None:
     """Compile the kernels of this file."""
     one, beam = np.ones((1, 1)), np.array([[[1.0, 0.0, 0.0]]])
     measure(
-        beam, np.zeros(1), np.eye(3)[None], one, one.astype(np.float32), -beam, 0.1, LidarNoise(),
-        np.random.default_rng(0),
+        beam, np.zeros(1), np.eye(3)[None], one, one.astype(np.int32), one.astype(np.float32),
+        -beam, 0.1, LidarNoise(), np.random.default_rng(0),
     )  # fmt: skip

@@ -64,8 +64,8 @@ def cast(
     ground = solids.ground
     _cast_kernel(
         np.ascontiguousarray(Ts_world_lidar), delays, directions, chances, farthest, shapes,
-        solids.forms, solids.boxes, solids.nodes, spheres, velocities, first, ground.heights,
-        ground.corner, ground.steepest, distance, hit, normals,
+        solids.forms, solids.boxes, solids.nodes, solids.num_still, spheres, velocities, first,
+        ground.heights, ground.corner, ground.steepest, distance, hit, normals,
     )  # fmt: skip
     return distance, hit, normals
 
@@ -203,122 +203,181 @@ def _enters(
 
 @kernel
 def _through_tree(
-    shapes: Array, forms: Index, boxes: Array, nodes: Index, stack: Index, enters: Array,
-    o: tuple[float, float, float], d: tuple[float, float, float], chance: float, best: float,
-    who: int,
-) -> tuple[float, int]:  # fmt: skip
-    """Return where a beam first meets what stands still, and whom; best and who if not before."""
-    ox, oy, oz = o
-    dx, dy, dz = d
-    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
-    stack[0], enters[0] = 0, 0.0
-    top = 1
-    while top > 0:
-        top -= 1
-        if enters[top] >= best:
-            continue
-        node = stack[top]
-        ta = _enters(boxes, node, 0, ox, oy, oz, ix, iy, iz, best)
-        tb = _enters(boxes, node, 6, ox, oy, oz, ix, iy, iz, best)
-        # The nearer child first: a leaf is searched at once, an inner node goes on the stack last.
-        first = 0 if ta <= tb else 2
-        for turn in range(2):
-            side = first if turn == 0 else 2 - first
-            if (ta if side == 0 else tb) < best and nodes[node, side] < 0:
-                begin = -1 - nodes[node, side]
-                for k in range(begin, begin + nodes[node, side + 1]):
-                    t = _meet(shapes, forms[k], k, ox, oy, oz, dx, dy, dz, chance, best)
-                    if t < best:
-                        best, who = t, k
-        for turn in range(2):
-            side = 2 - first if turn == 0 else first
-            enter = ta if side == 0 else tb
-            if enter < best and nodes[node, side] >= 0:
-                stack[top], enters[top] = nodes[node, side], enter
-                top += 1
-    return best, who
+    o: Array, rays: Array, chances: F32, shapes: Array, forms: Index, boxes: Array, nodes: Index,
+    stack: Index, enters: Array, best: Array, who: Ids,
+) -> None:  # fmt: skip
+    """Let all beams o + t rays[b] of a step meet what stands still, where that is before best."""
+    ox, oy, oz = o[0], o[1], o[2]
+    for r in range(rays.shape[0]):
+        dx, dy, dz = rays[r, 0], rays[r, 1], rays[r, 2]
+        ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
+        chance: float = chances[r]
+        near, found = best[r], who[r]
+        stack[0], enters[0] = 0, 0.0
+        top = 1
+        while top > 0:
+            top -= 1
+            if enters[top] >= near:
+                continue
+            node = stack[top]
+            ta = _enters(boxes, node, 0, ox, oy, oz, ix, iy, iz, near)
+            tb = _enters(boxes, node, 6, ox, oy, oz, ix, iy, iz, near)
+            # The nearer child first: a leaf is searched at once, a node goes on the stack last.
+            first = 0 if ta <= tb else 2
+            for turn in range(2):
+                side = first if turn == 0 else 2 - first
+                if (ta if side == 0 else tb) < near and nodes[node, side] < 0:
+                    begin = -1 - nodes[node, side]
+                    for k in range(begin, begin + nodes[node, side + 1]):
+                        t = _meet(shapes, forms[k], k, ox, oy, oz, dx, dy, dz, chance, near)
+                        if t < near:
+                            near, found = t, np.int32(k)
+            for turn in range(2):
+                side = 2 - first if turn == 0 else first
+                enter = ta if side == 0 else tb
+                if enter < near and nodes[node, side] >= 0:
+                    stack[top], enters[top] = nodes[node, side], enter
+                    top += 1
+        best[r], who[r] = near, found
+
+
+@kernel
+def _movers_ahead(
+    o: Array, rays: Array, spheres: Array, velocities: Array, delay: float, ahead: Index
+) -> int:
+    """Write the movers that the beams (B, 3) of a step can meet, and return how many.
+
+    With the middle m of the beams and their greatest angle from it, α, those with the angle from m
+    to a centre, distance c and radius r, at most α + asin(r/c).
+    """
+    if spheres.shape[0] == 0:
+        return 0
+    mx, my, mz = 0.0, 0.0, 0.0
+    for b in range(rays.shape[0]):
+        mx, my, mz = mx + rays[b, 0], my + rays[b, 1], mz + rays[b, 2]
+    long = max(np.sqrt(mx * mx + my * my + mz * mz), 1e-12)
+    mx, my, mz = mx / long, my / long, mz / long
+    least = 1.0
+    for b in range(rays.shape[0]):
+        least = min(least, mx * rays[b, 0] + my * rays[b, 1] + mz * rays[b, 2])
+    widest = np.arccos(max(min(least, 1.0), -1.0)) + 1e-6
+    count = 0
+    for k in range(spheres.shape[0]):
+        x = spheres[k, 0] + velocities[k, 0] * delay - o[0]
+        y = spheres[k, 1] + velocities[k, 1] * delay - o[1]
+        z = spheres[k, 2] + velocities[k, 2] * delay - o[2]
+        away = np.sqrt(x * x + y * y + z * z)
+        if away > spheres[k, 3]:
+            cosine = (x * mx + y * my + z * mz) / away
+            if np.arccos(max(min(cosine, 1.0), -1.0)) > widest + np.arcsin(spheres[k, 3] / away):
+                continue
+        ahead[count] = k
+        count += 1
+    return count
 
 
 @kernel
 def _among_movers(
-    shapes: Array, forms: Index, spheres: Array, velocities: Array, first: Index, delay: float,
-    o: tuple[float, float, float], d: tuple[float, float, float], best: float, who: int,
-) -> tuple[float, int]:  # fmt: skip
-    """Return where a beam first meets what moves, and whom; best and who if not before."""
-    dx, dy, dz = d
-    for k in range(spheres.shape[0]):
+    o: Array, rays: Array, delay: float, shapes: Array, forms: Index, spheres: Array,
+    velocities: Array, first: Index, ahead: Index, count: int, best: Array, who: Ids,
+) -> None:  # fmt: skip
+    """Let all beams of a step meet what moves, where that is before best."""
+    for n in range(count):
+        k = ahead[n]
         ox = o[0] - velocities[k, 0] * delay
         oy = o[1] - velocities[k, 1] * delay
         oz = o[2] - velocities[k, 2] * delay
         x, y, z = ox - spheres[k, 0], oy - spheres[k, 1], oz - spheres[k, 2]
-        b = x * dx + y * dy + z * dz
         beyond = x * x + y * y + z * z - spheres[k, 3] * spheres[k, 3]
-        if b * b < beyond or (beyond > 0.0 and b > 0.0):
-            continue
-        for i in range(first[k, 0], first[k, 1]):
-            t = _meet(shapes, forms[i], i, ox, oy, oz, dx, dy, dz, 0.0, best)
-            if t < best:
-                best, who = t, i
-    return best, who
+        for r in range(rays.shape[0]):
+            dx, dy, dz = rays[r, 0], rays[r, 1], rays[r, 2]
+            b = x * dx + y * dy + z * dz
+            if b * b < beyond or (beyond > 0.0 and b > 0.0):
+                continue
+            for i in range(first[k, 0], first[k, 1]):
+                t = _meet(shapes, forms[i], i, ox, oy, oz, dx, dy, dz, 0.0, best[r])
+                if t < best[r]:
+                    best[r], who[r] = t, i
+
+
+@kernel
+def _bound(
+    o: Array, rays: Array, chances: F32, farthest: float, shapes: Array, forms: Index,
+    heights: Array, corner: Array, steepest: float, last: Ids, best: Array, who: Ids,
+) -> None:  # fmt: skip
+    """Let all beams of a step meet the ground, and what stood before the same beam a step ago."""
+    for r in range(rays.shape[0]):
+        dx, dy, dz = rays[r, 0], rays[r, 1], rays[r, 2]
+        who[r] = NOTHING
+        best[r] = _follow(heights, corner, steepest, o[0], o[1], o[2], dx, dy, dz, farthest)
+        if best[r] < farthest:
+            who[r] = GROUND
+        i = last[r]
+        if i >= 0:
+            t = _meet(shapes, forms[i], i, o[0], o[1], o[2], dx, dy, dz, chances[r], best[r])
+            if t < best[r]:
+                best[r], who[r] = t, i
+
+
+@kernel
+def _normals(
+    o: Array, rays: Array, best: Array, who: Ids, shapes: Array, forms: Index, heights: Array,
+    corner: Array, normals: Array,
+) -> None:  # fmt: skip
+    """Write the normals of what the beams of a step met, towards the LiDAR."""
+    for r in range(rays.shape[0]):
+        dx, dy, dz = rays[r, 0], rays[r, 1], rays[r, 2]
+        x, y = o[0] + best[r] * dx, o[1] + best[r] * dy
+        i = who[r]
+        nx, ny, nz = np.nan, np.nan, np.nan
+        if i == GROUND:
+            _, zx, zy = _height(heights, corner[0], corner[1], 1.0 / corner[2], x, y)
+            nz = 1.0 / np.sqrt(1.0 + zx * zx + zy * zy)
+            nx, ny = -zx * nz, -zy * nz
+        elif i >= 0 and forms[i] == RECTANGLE:
+            nx, ny, nz = shapes[i, 0], shapes[i, 1], shapes[i, 2]
+            if nx * dx + ny * dy + nz * dz > 0.0:
+                nx, ny, nz = -nx, -ny, -nz
+        elif i >= 0 and forms[i] == CYLINDER:
+            nx, ny = (x - shapes[i, 0]) / shapes[i, 2], (y - shapes[i, 1]) / shapes[i, 2]
+            nz = 0.0
+        normals[r, 0], normals[r, 1], normals[r, 2] = nx, ny, nz
 
 
 @kernel
 def _cast_kernel(
     Ts: Array, delays: Array, directions: Array, chances: F32, farthest: float, shapes: Array,
-    forms: Index, boxes: Array, nodes: Index, spheres: Array, velocities: Array, first: Index,
-    heights: Array, corner: Array, steepest: float, distance: Array, hit: Ids, normals: Array,
+    forms: Index, boxes: Array, nodes: Index, num_still: int, spheres: Array, velocities: Array,
+    first: Index, heights: Array, corner: Array, steepest: float, distance: Array, hit: Ids,
+    normals: Array,
 ) -> None:  # fmt: skip
     """Write the nearest hit of every beam T d: distance, whom, and the normal there."""
     stack, enters = np.empty(DEPTH, np.int64), np.empty(DEPTH)
-    num_still = shapes.shape[0]
-    if first.shape[0] > 0:
-        num_still = first[0, 0]
+    ahead = np.empty(spheres.shape[0], np.int64)
+    rays, o = np.empty((directions.shape[1], 3)), np.empty(3)
+    last = np.full(directions.shape[1], NOTHING, np.int32)
     for s in range(directions.shape[0]):
         T = Ts[s]
-        o = (T[0, 3], T[1, 3], T[2, 3])
-        for b in range(directions.shape[1]):
-            x, y, z = directions[s, b, 0], directions[s, b, 1], directions[s, b, 2]
-            dx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
-            dy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
-            dz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
-            d = (dx, dy, dz)
-            chance: float = chances[s, b]
-            who = NOTHING
-            best = _follow(heights, corner, steepest, o[0], o[1], o[2], dx, dy, dz, farthest)
-            if best < farthest:
-                who = GROUND
-            if s > 0:
-                last = hit[s - 1, b]
-                if 0 <= last < num_still:
-                    t = _meet(shapes, forms[last], last, o[0], o[1], o[2], dx, dy, dz, chance, best)
-                    if t < best:
-                        best, who = t, last
-            best, who = _among_movers(
-                shapes, forms, spheres, velocities, first, delays[s], o, d, best, who
-            )
-            best, who = _through_tree(
-                shapes, forms, boxes, nodes, stack, enters, o, d, chance, best, who
-            )
-            distance[s, b], hit[s, b] = best, who
-            normals[s, b, 0], normals[s, b, 1], normals[s, b, 2] = np.nan, np.nan, np.nan
-            if who == GROUND:
-                _, zx, zy = _height(
-                    heights, corner[0], corner[1], 1.0 / corner[2], o[0] + best * dx,
-                    o[1] + best * dy,
-                )  # fmt: skip
-                long = np.sqrt(1.0 + zx * zx + zy * zy)
-                normals[s, b, 0], normals[s, b, 1] = -zx / long, -zy / long
-                normals[s, b, 2] = 1.0 / long
-            elif who >= 0 and forms[who] == RECTANGLE:
-                n = shapes[who]
-                sign = -1.0 if n[0] * dx + n[1] * dy + n[2] * dz > 0.0 else 1.0
-                for axis in range(3):
-                    normals[s, b, axis] = sign * n[axis]
-            elif who >= 0 and forms[who] == CYLINDER:
-                c = shapes[who]
-                normals[s, b, 0] = (o[0] + best * dx - c[0]) / c[2]
-                normals[s, b, 1] = (o[1] + best * dy - c[1]) / c[2]
-                normals[s, b, 2] = 0.0
+        for axis in range(3):
+            o[axis] = T[axis, 3]
+            for b in range(rays.shape[0]):
+                rays[b, axis] = (
+                    T[axis, 0] * directions[s, b, 0]
+                    + T[axis, 1] * directions[s, b, 1]
+                    + T[axis, 2] * directions[s, b, 2]
+                )
+        best, who = distance[s], hit[s]
+        _bound(
+            o, rays, chances[s], farthest, shapes, forms, heights, corner, steepest, last, best, who
+        )
+        count = _movers_ahead(o, rays, spheres, velocities, delays[s], ahead)
+        _among_movers(
+            o, rays, delays[s], shapes, forms, spheres, velocities, first, ahead, count, best, who
+        )
+        _through_tree(o, rays, chances[s], shapes, forms, boxes, nodes, stack, enters, best, who)
+        _normals(o, rays, best, who, shapes, forms, heights, corner, normals[s])
+        for b in range(rays.shape[0]):
+            last[b] = who[b] if who[b] < num_still else NOTHING
 
 
 def warm_up() -> None:

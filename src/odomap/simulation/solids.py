@@ -250,7 +250,7 @@ class SolidsBuilder:
         still, moving = np.flatnonzero(mover < 0), np.flatnonzero(mover >= 0)
         moving = moving[np.argsort(mover[moving], kind="stable")]
         ends = np.stack([np.array(self._low), np.array(self._high)], axis=1).reshape(-1, 2, 3)
-        tree = BoxTree.of(ends[still])
+        tree = BoxTree.of(ends[still], by_area=True)
         boxes, nodes = _paired(tree)
         rows = np.concatenate([still[tree.order], moving])
         shapes = np.array(self._rows).reshape(-1, 14)[rows]

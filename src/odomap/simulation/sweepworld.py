@@ -28,7 +28,7 @@ from odomap.sensors.rig import LidarMount, Rig
 from odomap.simulation.lidar import LidarNoise
 from odomap.simulation.path import Path
 from odomap.simulation.scanner import PATTERNS, Measured, Scanner, measure
-from odomap.simulation.solidcast import GROUND, NOTHING, cast
+from odomap.simulation.solidcast import GROUND, cast
 from odomap.simulation.solidrooms import solid_building, solid_room
 from odomap.simulation.solids import ALBEDO, Solids
 from odomap.simulation.town import field, town, tunnel
@@ -137,7 +137,7 @@ class SweepTruth:
             of leaves.
         is_ground: (N,) whether one could drive or walk on it.
         is_edge: (N,) whether the surface ends beside the point, seen along its line of beams: it
-            stands before what is beside it, or bends there.
+            stands before what is beside it, or bends there; never of leaves.
         is_hidden: (N,) whether what ends beside the point is what stands before it: such an end is
             no edge of anything, and moves with the LiDAR.
     """
@@ -258,7 +258,7 @@ class SweepWorld:
         R_world_lidar = np.ascontiguousarray(Ts[:, :3, :3])
         # The last of the table are of hits -2 and -1: ground, nothing.
         measured = measure(
-            directions, delays, R_world_lidar, distance, table[hit], normals, NEAREST_M,
+            directions, delays, R_world_lidar, distance, hit, table[hit], normals, NEAREST_M,
             LidarNoise().scaled(self.spec.noise), rng,
         )  # fmt: skip
         return measured, directions, distance, hit, normals, R_world_lidar
@@ -273,6 +273,7 @@ def _edges(
     neither explains; the nearer side has the edge, the farther side is hidden.
     """
     edge, hidden = np.zeros(hit.shape, np.bool_), np.zeros(hit.shape, np.bool_)
+    # Leaves have neither, but what is before or behind them does.
     other = hit[1:] != hit[:-1]
     step = distance[1:] - distance[:-1]
     nearer = np.minimum(distance[1:], distance[:-1])
@@ -290,4 +291,5 @@ def _edges(
             same = hit[rows] == (hit[:-1] if before else hit[1:])[at]
             edge[rows] |= has_edge & same
             hidden[rows] |= jump[at] & ((step[at] > 0) != before) & same
-    return edge & (hit != NOTHING), hidden & (hit != NOTHING)
+    is_surface = ~np.isnan(normals[:, :, 0])
+    return edge & is_surface, hidden & is_surface

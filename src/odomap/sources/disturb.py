@@ -6,6 +6,7 @@
     duplicate, kill_right           frames delivered twice, a pair whose right camera dies
     pierce_depth, roughen_depth     depth with holes (glass, black cloth, the sun), or noise
     walkers, lose_scans             people around a laser, scans that say nothing
+    lose_sweeps, turn_lidar, ...    what goes wrong with a 3D LiDAR (`disturb_sweeps`)
     mirror_laser, turn_laser, widen a laser upside down, turned, or of another field of view
     slip, set_back                  wheels that slip, a clock that goes back
     reverse, there_and_back         the same recording played backwards, or forth and back
@@ -15,9 +16,9 @@ that of the frames it gives, so wrappers nest and every metric works on them. Pl
 back, a recording passes every place twice, on different images (even frames forth, odd frames
 back), with known truth: a loop, made from any sequence.
 
-Time reversal maps an instant t to first + last - t. A pose stays what it is, so truth is re-timed.
-Inertial samples do not survive it (rates change sign, gravity does not), nor the even spacing of
-there-and-back, so these two sources have no IMU.
+Time reversal maps an instant t to first + last - t: truth is re-timed, and a point that came t
+after the stamp of its sweep comes t before it. Inertial samples do not survive it (rates change
+sign, gravity does not), nor the even spacing of there-and-back, so these two sources have no IMU.
 
 Reference: J. Engel, V. Usenko, D. Cremers, "A photometrically calibrated benchmark for monocular
 visual odometry", arXiv:1607.02555, 2016 (sequences played forwards and backwards).
@@ -44,6 +45,15 @@ from odomap.sources.disturb_scans import (
     widen,
 )
 from odomap.sources.disturb_streams import duplicate, kill_right
+from odomap.sources.disturb_sweeps import (
+    compensate,
+    lose_sweeps,
+    miscount_beams,
+    misscale_times,
+    turn_lidar,
+    with_misses,
+    without_columns,
+)
 from odomap.sources.disturb_things import cover, moving_object
 from odomap.sources.source import Source
 from odomap.sources.wrappers import Changed, Dropped, Frozen, Replayed, seekable
@@ -51,6 +61,7 @@ from odomap.sources.wrappers import Changed, Dropped, Frozen, Replayed, seekable
 __all__ = [
     "blank",
     "blur",
+    "compensate",
     "cover",
     "drop",
     "duplicate",
@@ -58,7 +69,10 @@ __all__ = [
     "freeze",
     "kill_right",
     "lose_scans",
+    "lose_sweeps",
     "mirror_laser",
+    "miscount_beams",
+    "misscale_times",
     "moving_object",
     "overexpose",
     "pierce_depth",
@@ -68,8 +82,11 @@ __all__ = [
     "slip",
     "there_and_back",
     "turn_laser",
+    "turn_lidar",
     "walkers",
     "widen",
+    "with_misses",
+    "without_columns",
 ]
 
 PATCH_PX = 8
@@ -253,7 +270,12 @@ def reverse(source: Source) -> Source:
             truth.Ts_world_body[::-1],
             None if truth.covariances is None else truth.covariances[::-1],
         )
-    return Replayed(inner, "reversed", order, mirror - stamps[::-1], truth)
+    backwards = np.ones(len(order), np.bool_)
+    played = Replayed(inner, "reversed", order, mirror - stamps[::-1], truth, backwards)
+    other = {"clockwise": "counter_clockwise", "counter_clockwise": "clockwise", "none": "none"}
+    lidars = tuple(replace(mount, sweep=other[mount.sweep]) for mount in played.rig.lidars)
+    played.rig = replace(played.rig, lidars=lidars)
+    return played
 
 
 def there_and_back(source: Source) -> Source:
@@ -277,9 +299,8 @@ def there_and_back(source: Source) -> Source:
     order = np.concatenate([places[::2], places[1::2][::-1]])
     step = 2 * round(float(np.median(np.diff(stamps))))
     played = stamps[0] + places * step
-    return Replayed(
-        inner, "there and back", order, played, _retimed(source.truth, stamps[order], played)
-    )
+    truth = _retimed(source.truth, stamps[order], played)
+    return Replayed(inner, "there and back", order, played, truth, order % 2 == 1)
 
 
 def _retimed(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from odomap.errors import InputError
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame, ImuSamples
+from odomap.sensors.sweep import Sweep
 from odomap.sources.source import RandomAccess, Skipped, Source, UnusableFrame
 
 __all__ = ["Changed", "Dropped", "Frozen", "Replayed", "Wrapper", "seekable"]
@@ -158,12 +159,13 @@ class Replayed(Wrapper):
         order: NDArray[np.int_],
         stamps_ns: NDArray[np.int64],
         truth: Trajectory | None,
+        is_backwards: NDArray[np.bool_],
     ) -> None:
         super().__init__(source, how)
         self.rig = source.rig.without_imu()
         self.truth = truth
         self.stamps_ns = stamps_ns
-        self._order = order
+        self._order, self._is_backwards = order, is_backwards
 
     @property
     def ids(self) -> NDArray[np.int_]:
@@ -186,4 +188,13 @@ class Replayed(Wrapper):
             frame = self._inside.frame(int(self._order[index]))
         except UnusableFrame as error:
             raise UnusableFrame(replace(error.skipped, stamp_ns=stamp_ns)) from error
-        return replace(frame, id=index, stamp_ns=stamp_ns, imu=None)
+        cloud = frame.cloud
+        if cloud is not None and self._is_backwards[index]:
+            cloud = _mirrored(cloud)
+        return replace(frame, id=index, stamp_ns=stamp_ns, imu=None, cloud=cloud)
+
+
+def _mirrored(sweep: Sweep) -> Sweep:
+    """Return a sweep as it comes backwards in time: what came t after the stamp comes t before."""
+    back = sweep.only(np.arange(len(sweep))[::-1])
+    return back if back.times is None else replace(back, times=-back.times)
