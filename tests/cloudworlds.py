@@ -112,7 +112,7 @@ class Drive:
         self.true, self.map, self.loops = Ts, Map(), []
         self.clouds = [street.cloud(T @ self.T_body_lidar, k) for k, T in enumerate(Ts)]
         self.sigma, self.rng = STEP * drift, np.random.default_rng([seed, 43])
-        self.pose, self.covariance, self.ids = Ts[0], np.zeros((6, 6)), []
+        self.ids = []
 
     def go(self, closer=None, last=None, done=None):
         """Drive on to a keyframe, closing loops with a closer; `done` is told of each."""

@@ -21,15 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.graphs.graphproblem import import_group
-from odomap.geometry.lie import se3_adjoint, se3_inverse, so3_log
+from odomap.geometry.lie import se3_inverse, so3_log
 from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.cloudconfig import CloudClosingConfig
 from odomap.system.cloudgraph import CloudPath, Tie, graph_of
-from odomap.system.cloudplaces import CloudPlaces, Places, cloud_points, read_places
+from odomap.system.cloudplaces import Places, cloud_points, read_places
 from odomap.system.cloudsearch import Candidate, CloudSearch
-from odomap.system.cloudverifying import lay, of_bodies
+from odomap.system.cloudverifying import CloudJudge
 from odomap.system.correction import correction
 from odomap.system.stages import Loop
 
@@ -54,7 +54,7 @@ class CloudCloser:
     def __init__(self, map: Map, T_body_lidar: Array, config: CloudClosingConfig) -> None:
         self._map, self._T_body_lidar, self._config = map, np.array(T_body_lidar), config
         self._search = CloudSearch(config)
-        self._places = CloudPlaces(config.neighbours, config.voxel, config.max_distance)
+        self._judge = CloudJudge(self._T_body_lidar, config)
         self._since_solved = self._pending = 0
         self._tied_at: Array | None = None
         self._alone: dict[Pair, tuple[Array, Tie]] = {}
@@ -118,22 +118,12 @@ class CloudCloser:
         self, keyframe: Keyframe, places: Places, row: int, candidate: Candidate
     ) -> Tie | Loop:
         """Lay a keyframe's cloud onto a place."""
-        there, Ts = places.keyframes[candidate.row], places.Ts_world_lidar
-        laid = lay(
-            cloud_points(keyframe),
-            self._places.target(places, candidate.row),
-            cloud_points(there),
-            (Ts[row, 2, :3], Ts[candidate.row, 2, :3]),
-            candidate.T_place_lidar,
-            self._config,
-        )
-        T, information = of_bodies(laid.T_place_lidar, laid.information, self._T_body_lidar)
+        up = places.Ts_world_lidar[row, 2, :3]
+        laid = self._judge.lay(places, candidate, cloud_points(keyframe), up)
+        ends, T = (keyframe.id, int(places.ids[candidate.row])), laid.T_place_body
         if laid.reason:
-            return Loop(keyframe.id, there.id, T, laid.num_inliers, False, laid.reason)
-        Ad = se3_adjoint(se3_inverse(T))
-        bent = Ad @ places.bent(candidate.row, self._config.neighbours) @ Ad.T
-        sure = np.asarray(np.linalg.inv(np.linalg.inv(information) + bent))
-        return Tie(keyframe.id, there.id, T, sure, laid.num_inliers)
+            return Loop(*ends, T, laid.num_inliers, False, laid.reason)
+        return Tie(*ends, T, laid.information, laid.num_inliers)
 
     def solve(self, places: Places, ties: list[Tie]) -> CloudPath:
         """Find the path that agrees best with steps and loops, new ones among them."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
 
-__all__ = ["CloudClosingConfig", "CloudThinningConfig"]
+__all__ = ["CloudClosingConfig", "CloudRecognitionConfig", "CloudThinningConfig"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,25 @@ class CloudClosingConfig:
     """Factor on all standard deviations while it is decided which loops are true."""
     outlying: Positive = 10.0
     """Standard deviations at which a loop counts half."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
+class CloudRecognitionConfig:
+    """When a sweep is recognised in a map, of which nothing else says where it was taken."""
+
+    alike: Fraction = 0.5
+    """Largest distance of how it looks and how a place does."""
+    most: Count = 4
+    """Places that it is laid onto."""
+    overlap: Fraction = 0.7
+    """Share of it that must meet what is known."""
+    against: Fraction = 0.04
+    """Share of what stands up in one that the other may have looked through."""
+    sigma: Positive = 0.5
+    """Largest standard deviation of where it is, metres."""
 
     def __post_init__(self) -> None:
         check_limits(self)

@@ -32,10 +32,11 @@ from odomap.geometry.lie import se3_adjoint, se3_inverse
 from odomap.lidar.cloud import Cloud
 from odomap.lidar.registration import Registration, register
 from odomap.lidar.sightlines import Panorama, Seen
-from odomap.lidar.target import Target
 from odomap.system.cloudconfig import CloudClosingConfig
+from odomap.system.cloudplaces import CloudPlaces, Places, cloud_points
+from odomap.system.cloudsearch import Candidate
 
-__all__ = ["Laid", "lay", "of_bodies", "stands_up"]
+__all__ = ["CloudJudge", "Laid", "stands_up"]
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,8 @@ class Laid:
     """How a cloud lies on a place.
 
     Attributes:
-        T_place_lidar: (4, 4).
+        row: of the keyframe there.
+        T_place_body: (4, 4) where the body is in its frame.
         information: (6, 6) of that, right tangent.
         num_inliers: points that meet what is known.
         overlap: share of them.
@@ -60,7 +62,8 @@ class Laid:
         reason: why it is not believed; empty if it is.
     """
 
-    T_place_lidar: Array
+    row: int
+    T_place_body: Array
     information: Array
     num_inliers: int
     overlap: float
@@ -68,41 +71,67 @@ class Laid:
     reason: str
 
 
-def lay(
-    points: Array,
-    place: Target,
-    there: Array,
-    ups: tuple[Array, Array],
-    guess: Array,
-    config: CloudClosingConfig,
-) -> Laid:
-    """Lay a cloud onto a place, and judge whether it belongs there.
+class CloudJudge:
+    """Lays clouds onto places, and judges whether they belong there.
 
     Args:
-        points: (N, 3) the cloud.
-        place: what is known there, in the frame of the LiDAR that saw it.
-        there: (M, 3) what that LiDAR saw in its sweep alone.
-        ups: (3,) which way is up in the cloud, and there.
-        guess: (4, 4) T_place_lidar.
-        config: what it must show.
+        T_body_lidar: (4, 4) where the LiDAR is on the body.
+        config: what a cloud must show.
     """
-    try:
-        found = register(
-            Cloud.of(points),
-            place,
-            "gicp",
-            initial=guess,
-            voxel=config.voxel,
-            max_distance=config.max_distance,
+
+    def __init__(self, T_body_lidar: Array, config: CloudClosingConfig) -> None:
+        self._T_body_lidar, self._config = np.array(T_body_lidar), config
+        self._places = CloudPlaces(config.neighbours, config.voxel, config.max_distance)
+
+    def lay(self, places: Places, candidate: Candidate, points: Array, up: Array) -> Laid:
+        """Lay a cloud onto a place.
+
+        Args:
+            places: of the map.
+            candidate: which of them, and a first guess.
+            points: (N, 3) seen from the LiDAR.
+            up: (3,) which way is up there.
+        """
+        config, row = self._config, candidate.row
+        there, ups = cloud_points(places.keyframes[row]), (up, places.Ts_world_lidar[row, 2, :3])
+        guess = self._of_body(candidate.T_place_lidar)
+        try:
+            found = register(
+                Cloud.of(points),
+                self._places.target(places, row),
+                "gicp",
+                initial=candidate.T_place_lidar,
+                voxel=config.voxel,
+                max_distance=config.max_distance,
+            )
+        except InputError as error:
+            return Laid(row, guess, np.zeros((6, 6)), 0, 0.0, 1.0, str(error))
+        T, overlap = found.T_target_source, found.num_inliers / found.num_points
+        seen = Panorama(there).judge(stands_up(points, ups[0]), T)
+        back = Panorama(points).judge(stands_up(there, ups[1]), se3_inverse(T))
+        return Laid(
+            row,
+            self._of_body(T),
+            self._information(places, row, found),
+            found.num_inliers,
+            overlap,
+            max(seen.doubt, back.doubt),
+            _reason(found, overlap, (seen, back), config),
         )
-    except InputError as error:
-        return Laid(guess, np.zeros((6, 6)), 0, 0.0, 1.0, str(error))
-    T, overlap = found.T_target_source, found.num_inliers / found.num_points
-    seen = Panorama(there).judge(stands_up(points, ups[0]), T)
-    back = Panorama(points).judge(stands_up(there, ups[1]), se3_inverse(T))
-    doubt = max(seen.doubt, back.doubt)
-    reason = _reason(found, overlap, (seen, back), config)
-    return Laid(T, _information(found), found.num_inliers, overlap, doubt, reason)
+
+    def _of_body(self, T_a_b: Array) -> Array:
+        """Return how bodies lie of how their LiDARs do."""
+        return np.asarray(self._T_body_lidar @ T_a_b @ se3_inverse(self._T_body_lidar))
+
+    def _information(self, places: Places, row: int, found: Registration) -> Array:
+        """Return the information (6, 6) of a body, honest about errors that are not independent."""
+        known = np.linalg.inv(found.information + np.linalg.inv(UNKNOWN))
+        covariance = INFLATED * known + np.diag((FLOOR * found.error) ** 2)
+        to_body = se3_adjoint(self._T_body_lidar)
+        to_here = se3_adjoint(se3_inverse(self._of_body(found.T_target_source)))
+        bent = to_here @ places.bent(row, self._config.neighbours) @ to_here.T
+        information = np.linalg.inv(to_body @ covariance @ to_body.T + bent)
+        return np.asarray(0.5 * (information + information.T))
 
 
 def _reason(
@@ -128,18 +157,3 @@ def stands_up(points: Array, up: Array) -> Array:
     ground = np.partition(heights, lowest)[lowest] if len(heights) else 0.0
     tall = heights > ground + TALL
     return points[tall] if tall.sum() >= FEWEST else points
-
-
-def _information(found: Registration) -> Array:
-    """Return the information (6, 6) of a pose, honest about errors that are not independent."""
-    known = np.linalg.inv(found.information + np.linalg.inv(UNKNOWN))
-    covariance = INFLATED * known + np.diag((FLOOR * found.error) ** 2)
-    information = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (information + information.T))
-
-
-def of_bodies(T_a_b: Array, information: Array, T_body_lidar: Array) -> tuple[Array, Array]:
-    """Return how bodies lie, (4, 4), and the information (6, 6), of how their LiDARs do."""
-    back = se3_inverse(T_body_lidar)
-    Ad = se3_adjoint(back)
-    return T_body_lidar @ T_a_b @ back, Ad.T @ information @ Ad
