@@ -1,6 +1,6 @@
 """Small bags of every kind, written by rosbags: a robot that drives along x with a laser on it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ class Robot:
         stamps: of the scans; default evenly spaced.
         strange: whether a topic has a type nobody knows.
         changes: of scans: number -> fields that differ.
+        clouds: topics of its 3D LiDARs, and the frame each is in.
+        cloud: fields of the PointCloud2 of a number, without its header.
     """
 
     scans: dict[str, str] = field(default_factory=lambda: {"/scan": "laser"})
@@ -36,6 +38,8 @@ class Robot:
     )
     strange: bool = False
     changes: dict[int, dict[str, Any]] = field(default_factory=dict)
+    clouds: dict[str, str] = field(default_factory=dict)
+    cloud: Callable[[int], dict[str, Any]] = lambda k: {}
 
 
 def messages(robot: Robot, store: Any) -> Iterator[tuple[str, str, int, Any]]:
@@ -89,6 +93,8 @@ def messages(robot: Robot, store: Any) -> Iterator[tuple[str, str, int, Any]]:
         if k >= 0 and k % 2 == 0 and k // 2 < len(robot.stamps):
             for topic, frame in robot.scans.items():
                 yield from _scan(robot, types, header, topic, frame, k // 2)
+            for topic, frame in robot.clouds.items():
+                yield from _cloud(robot, types, header, topic, frame, k // 2)
         if robot.strange:
             yield "/strange", "std_msgs/msg/Float64", now, types["std_msgs/msg/Float64"](1.0)
 
@@ -112,6 +118,53 @@ def _scan(
     } | robot.changes.get(k, {})
     kind = "sensor_msgs/msg/LaserScan"
     yield topic, kind, START_NS + k * STEP_NS + 3_000_000, types[kind](**fields)
+
+
+def _cloud(
+    robot: Robot, types: Any, header: Any, topic: str, frame: str, k: int
+) -> Iterator[tuple[str, str, int, Any]]:
+    fields = robot.cloud(k)
+    one = types["sensor_msgs/msg/PointField"]
+    fields["fields"] = [one(*words) for words in fields["fields"]]
+    kind = "sensor_msgs/msg/PointCloud2"
+    message = types[kind](header(robot.stamps[k], frame), **fields)
+    yield topic, kind, START_NS + k * STEP_NS + 3_000_000, message
+
+
+KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def cloud_fields(
+    columns: dict[str, Any], big: bool = False, gap: int = 3, height: int = 1, line_gap: int = 0
+) -> dict[str, Any]:
+    """Return the fields of a PointCloud2 without its header.
+
+    Args:
+        columns: (N,) each.
+        big: whether the highest byte comes first.
+        gap: bytes behind each value that mean nothing.
+        height: rows of the cloud.
+        line_gap: bytes behind each row that mean nothing.
+    """
+    fields, at = [], 0
+    for name, column in columns.items():
+        fields.append((name, at, KINDS[column.dtype.str[1:]], 1))
+        at += column.dtype.itemsize + gap
+    order = ">" if big else "<"
+    row = np.dtype({
+        "names": list(columns), "formats": [order + c.dtype.str[1:] for c in columns.values()],
+        "offsets": [f[1] for f in fields], "itemsize": at,
+    })  # fmt: skip
+    count = len(next(iter(columns.values())))
+    rows = np.zeros(count, row)
+    for name, column in columns.items():
+        rows[name] = column
+    lines = np.frombuffer(rows.tobytes(), np.uint8).reshape(height, -1)
+    data = np.pad(lines, ((0, 0), (0, line_gap)), constant_values=255).reshape(-1)
+    return {
+        "height": height, "width": count // height, "fields": fields, "is_bigendian": big,
+        "point_step": at, "row_step": lines.shape[1] + line_gap, "data": data, "is_dense": False,
+    }  # fmt: skip
 
 
 def write_bag(path: Path, kind: str, robot: Robot | None = None) -> Path:

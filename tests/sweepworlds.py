@@ -52,6 +52,19 @@ def road(
     return np.concatenate(rows), np.concatenate(numbers)
 
 
+def turning(frame: int, beams: int = 16, columns: int = 360) -> dict[str, NDArray[np.generic]]:
+    """Return a sweep in the order in which a turning LiDAR measures, with beam and time in ns."""
+    points, beam = road(beams, columns, seed=frame)
+    share = (-np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)) % 1
+    order = np.lexsort((beam, share))
+    return {
+        **{name: points[order, k].astype(np.float32) for k, name in enumerate(("x", "y", "z"))},
+        "intensity": np.arange(len(order)).astype(np.float32),
+        "ring": beam[order].astype(np.uint16),
+        "t": (share[order] * 1e8).astype(np.uint32),
+    }
+
+
 def write_velodyne(root: Path, frames: int = 5, beams: int = 64, columns: int = 720) -> Path:
     """Write sweeps as KITTI does, with times and truth of a car at 10 m/s."""
     (root / "velodyne").mkdir(parents=True)

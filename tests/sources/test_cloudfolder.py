@@ -12,25 +12,14 @@ from odomap.errors import CalibrationError, InputError
 from odomap.sensors.rig import LidarMount, Rig
 from odomap.sources.cloudfolder import CloudSource
 from odomap.sources.source import RandomAccess, UnusableFrame
-from sweepworlds import pcd_bytes, road
+from sweepworlds import pcd_bytes, turning
 
 Columns = dict[str, NDArray[np.generic]]
 START_S = 1_700_000_000
 
 
-def columns(
-    frame: int, beams: int = 16, **more: Callable[[Columns], NDArray[np.generic]]
-) -> Columns:
-    """Return a sweep in the order in which a turning LiDAR measures, with beam and time."""
-    points, beam = road(beams, 360, seed=frame)
-    share = (-np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)) % 1
-    order = np.lexsort((beam, share))
-    found: Columns = {
-        name: points[order, k].astype(np.float32) for k, name in enumerate(("x", "y", "z"))
-    }
-    found["intensity"] = np.arange(len(order)).astype(np.float32)
-    found["ring"] = beam[order].astype(np.uint16)
-    found["t"] = (share[order] * 1e8).astype(np.uint32)
+def columns(frame: int, **more: Callable[[Columns], NDArray[np.generic]]) -> Columns:
+    found = turning(frame)
     for name, make in more.items():
         found[name] = make(found)
     return found

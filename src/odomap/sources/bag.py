@@ -30,7 +30,7 @@ from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import LidarMount, Rig
-from odomap.sources.bagfile import BagFile, Topic
+from odomap.sources.bagfile import CLOUD, SCAN, BagFile, Topic
 from odomap.sources.bagrecords import Cut
 from odomap.sources.options import check_options
 from odomap.sources.scanlog import mounted, rate_of
@@ -43,7 +43,7 @@ __all__ = ["BagSource"]
 Array = NDArray[np.float64]
 
 OPTIONS = ("scan", "odometry", "order")
-SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 USUAL = {SCAN: ("/scan", "/base_scan", "/front/scan"), ODOMETRY: ("/odom", "/odometry", "/wheel")}
 REACH_NS = 200_000_000
@@ -90,12 +90,13 @@ class BagSource:
     """
 
     def __init__(
-        self, path: str | Path, rig: Rig | None = None, options: Mapping[str, str] | None = None
-    ) -> None:
+        self, path: str | Path | BagFile, rig: Rig | None = None,
+        options: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         """Open a bag.
 
         Args:
-            path: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+            path: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; or one that is open.
             rig: its one LiDAR is used instead of what the bag says of mount and angles.
             options: scan and odometry (topics; odometry=off leaves it out), order (as of logs).
 
@@ -104,9 +105,9 @@ class BagSource:
             InputError: it cannot be read, holds no scans, or an option is wrong.
             CalibrationError: the rig is for another number of beams.
         """
-        path, options = Path(path), dict(options or {})
+        self._bag = bag = path if isinstance(path, BagFile) else BagFile(Path(path))
+        path, options = bag.given, dict(options or {})
         check_options(path, options, OPTIONS)
-        self._bag = bag = BagFile(path)
         self.name = path.name
         self.truth: Trajectory | None = None
         self.notes, self.left_out = bag.notes, list[Skipped]()
@@ -114,6 +115,9 @@ class BagSource:
         if self._scan == "":
             held = ", ".join(f"{t.name} ({t.kind})" for t in bag.topics[:6]) or "nothing"
             raise InputError(f"{path}: holds no LaserScan; it holds {held}")
+        clouds = [topic.name for topic in bag.topics if topic.kind == CLOUD and topic.count]
+        if clouds:
+            self.notes.append(f"holds clouds of a 3D LiDAR, too: ?cloud={clouds[0]}")
         wheels = options.get("odometry", "")
         is_off = wheels == "off"
         topic = "" if is_off else _chosen(bag, ODOMETRY, wheels, self.notes)

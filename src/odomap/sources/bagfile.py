@@ -7,6 +7,7 @@ Only messages of known types are decoded, by the definitions of the ROS releases
 in the file, so that a type nobody knows, or one whose definition is broken, costs nothing.
 """
 
+import struct
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
@@ -25,11 +26,13 @@ from odomap.sources.bagrecords import (
     records,
 )
 
-__all__ = ["BagFile", "Topic", "is_bag"]
+__all__ = ["CLOUD", "SCAN", "BagFile", "Head", "Topic", "is_bag"]
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 KNOWN = {
-    "sensor_msgs/msg/LaserScan": "sensor_msgs/msg/LaserScan",
+    SCAN: SCAN,
+    CLOUD: CLOUD,
     "nav_msgs/msg/Odometry": "nav_msgs/msg/Odometry",
     "tf2_msgs/msg/TFMessage": "tf2_msgs/msg/TFMessage",
     "tf/msg/tfMessage": "tf2_msgs/msg/TFMessage",
@@ -46,6 +49,14 @@ class Topic:
     name: str
     kind: str
     count: int
+
+
+@dataclass(frozen=True)
+class Head:
+    """When and in which frame a message was measured; nothing else of it."""
+
+    stamp_ns: int
+    frame: str
 
 
 def is_bag(path: Path) -> bool:
@@ -69,7 +80,8 @@ class BagFile:
     """The messages of a bag.
 
     Attributes:
-        path: file or folder.
+        path: file or folder that is read.
+        given: file or folder that was asked for.
         topics: what is in it, by name.
         notes: what is odd about it.
         is_indexed: whether messages of a time can be found without reading all before.
@@ -86,7 +98,7 @@ class BagFile:
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError as error:
             raise MissingExtra(f"{path}: a bag needs rosbags: pip install 'odomap[ros]'") from error
-        self.path = path
+        self.path = self.given = path
         self.notes: list[str] = []
         self._stores = {
             "ros1": get_typestore(Stores.ROS1_NOETIC),
@@ -155,13 +167,14 @@ class BagFile:
             yield from records(file, _unpackers())
 
     def messages(
-        self, topics: Collection[str], at_ns: int | None = None
+        self, topics: Collection[str], at_ns: int | None = None, heads: Collection[str] = ()
     ) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time of recording in ns, and message, of known types.
 
         Args:
             topics: names of those wanted.
             at_ns: only messages recorded then.
+            heads: topics of which only the header is read, as a `Head`.
 
         Raises:
             Cut: after the last message that can be read, if the file is damaged there.
@@ -173,7 +186,7 @@ class BagFile:
                 continue
             read = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
             try:
-                message = read(data, KNOWN[kind])
+                message = _head(data, encoding) if topic in heads else read(data, KNOWN[kind])
             # The bytes of one message are not what its type says; that fails as anything.
             except Exception as error:
                 raise Cut(f"a message of {topic} cannot be decoded ({error})") from error
@@ -200,6 +213,18 @@ class BagFile:
             except Exception as error:
                 raise Cut(f"is damaged ({' '.join(str(error).split())})") from error
             yield connection.topic, connection.msgtype, encoding, int(time_ns), bytes(data)
+
+
+def _head(data: bytes, encoding: str) -> Head:
+    """Read the header that a message begins with."""
+    if encoding == "ros1":
+        _, seconds, rest, length = struct.unpack_from("<4I", data)
+        name = data[16 : 16 + length]
+    else:
+        order = "<" if data[1] & 1 else ">"
+        seconds, rest, length = struct.unpack_from(f"{order}iII", data, 4)
+        name = data[16 : 16 + length].rstrip(b"\0")
+    return Head(seconds * 10**9 + rest, name.decode())
 
 
 def _unpackers() -> dict[str, Callable[[bytes], bytes]]:

@@ -10,7 +10,8 @@ Recognised by what a folder holds, not by its name:
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
     laser log         a file: CARMEN's (.clf, .log, also .bz2 or .gz), or Odometry and Laser lines
-    bag               a ROS 1 .bag, an MCAP file, a ROS 2 bag (its folder, .mcap or .db3)
+    bag               a ROS 1 .bag, an MCAP file, a ROS 2 bag (its folder, .mcap or .db3), with
+                      LaserScan or PointCloud2
     live camera       a name "camera:0", "camera:0?width=640&height=480"
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
@@ -46,7 +47,7 @@ SUPPORTED = (
     "KITTI velodyne (velodyne/*.bin), TUM RGB-D (rgb.txt, depth.txt), "
     "folders of clouds (.pcd, .ply, .las, .npy), videos (.mp4, .mov, .avi, .mkv, ...), "
     "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
-    "bags of ROS 1 and 2 with laser scans (.bag, .mcap, .db3, or the folder of one), "
+    "bags of ROS 1 and 2 with scans or clouds (.bag, .mcap, .db3, or the folder of one), "
     "live cameras ('camera:0'), "
     "simulated worlds (world.yaml, or a name like 'sim:room?seed=3&frames=100')"
 )
@@ -104,9 +105,16 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
 
 
 def _bag(path: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
+    """Return the source of a bag: of its 2D scans, or where it has none, of its clouds."""
     from odomap.sources.bag import BagSource
+    from odomap.sources.bagfile import CLOUD, SCAN, BagFile
+    from odomap.sources.cloudbag import CloudBagSource
 
-    source: Source = BagSource(path, None if rig is None else load_rig(rig), options)
+    given = None if rig is None else load_rig(rig)
+    bag = BagFile(path)
+    kinds = {topic.kind for topic in bag.topics if topic.count}
+    has_clouds = "cloud" in options or (CLOUD in kinds and SCAN not in kinds)
+    source: Source = (CloudBagSource if has_clouds else BagSource)(bag, given, options)
     return source
 
 

@@ -36,6 +36,8 @@ INTENSITY = (
     "scalar_intensity",
 )
 OPTIONS = ("time", "unit", "ring")
+FARTHEST_M = 1e7
+"""No point is farther, also where coordinates are those of a map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +77,23 @@ class PointFields:
                 seen &= np.isfinite(raw)
             times = self.times.seconds(raw, stamp_ns, seen)
         strength = table.columns.get(self.intensity) if self.intensity else None
+        with np.errstate(invalid="ignore", over="ignore"):
+            intensities = None if strength is None else strength.astype(np.float32)
         return Sweep(
             points,
             times,
-            None if strength is None else strength.astype(np.float32),
+            intensities,
             None if self.beams is None else self.beams.of(table, points),
         )
 
 
 def points_of_table(table: PointTable) -> Array:
-    """Return (N, 3) points of a table."""
-    return np.stack([table.columns[_xyz(table, axis)] for axis in "xyz"], axis=1).astype(np.float64)
+    """Return (N, 3) points of a table; places that cannot be are NaN."""
+    with np.errstate(invalid="ignore", over="ignore"):  # bytes that were damaged are any number
+        columns = [table.columns[_xyz(table, axis)].astype(np.float64) for axis in "xyz"]
+        points = np.stack(columns, axis=1)
+        points[~(np.abs(points) < FARTHEST_M).all(axis=1)] = np.nan
+    return points
 
 
 def _xyz(table: PointTable, axis: str) -> str:
