@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import odomap
 from odomap.lidar.deskew import deskew
 from odomap.sources.velodyne import VelodyneSource
+from odomap.sources.velodynepcap import PcapSource
 
 
 def test_kitti(data_folder: Path) -> None:
@@ -49,3 +51,18 @@ def test_compensated_kitti_is_recognised(tmp_path: Path, data_folder: Path) -> N
     assert sweep.times is None
     assert without.rig.lidars[0].beams == 64
     assert any("the ground steps by 1.1" in note for note in without.notes)
+
+
+def test_capture(data_folder: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    source = odomap.open(data_folder / "containers" / "sample_velodyne_vlp16_gps.pcap")
+    assert isinstance(source, PcapSource)
+    assert (len(source), source.skipped) == (4, [])
+    assert source.details == {"model": "VLP16", "packets": "293, 0 lost"}
+    sweep = source.frame(1).cloud
+    assert sweep is not None
+    assert sweep.times is not None
+    assert sweep.beams is not None
+    assert 18000 < len(sweep) < 19000
+    assert 0.098 < sweep.times.max() < 0.102
+    assert (np.bincount(sweep.beams) > 200).sum() == 16

@@ -6,6 +6,7 @@ Recognised by what a folder holds, not by its name:
     KITTI odometry    image_0/ (image_1/, or image_2/ image_3/), calib.txt, times.txt
     TUM RGB-D         rgb.txt, depth.txt, rgb/, depth/
     KITTI velodyne    velodyne/*.bin, times.txt; or velodyne_points/data/*.bin
+    capture           a .pcap of a Velodyne LiDAR
     clouds            a folder of *.pcd, *.ply, *.las or *.npy, one per sweep; or one of these
     image folder      *.png, *.jpg, ..., or left/ and right/, and a rig.yaml
     video             a file: clip.mp4, .mov, .avi, .mkv, ...
@@ -34,10 +35,12 @@ from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
 from odomap.sources.logfiles import beginnings
 from odomap.sources.options import check_options, split_options
+from odomap.sources.packets import is_pcap
 from odomap.sources.plainlog import WORDS, PlainLogSource
 from odomap.sources.source import Source
 from odomap.sources.tum import TumSource, is_tum
 from odomap.sources.velodyne import VelodyneSource, is_velodyne
+from odomap.sources.velodynepcap import PcapSource
 from odomap.sources.video import VideoSource, is_video
 
 __all__ = ["SUPPORTED", "open"]
@@ -45,7 +48,8 @@ __all__ = ["SUPPORTED", "open"]
 SUPPORTED = (
     "EuRoC (mav0/cam0/data.csv), KITTI odometry (image_0/, calib.txt), "
     "KITTI velodyne (velodyne/*.bin), TUM RGB-D (rgb.txt, depth.txt), "
-    "folders of clouds (.pcd, .ply, .las, .npy), videos (.mp4, .mov, .avi, .mkv, ...), "
+    "folders of clouds (.pcd, .ply, .las, .npy), captures of a Velodyne (.pcap), "
+    "videos (.mp4, .mov, .avi, .mkv, ...), "
     "folders of images (one, or left/ and right/), laser logs (CARMEN .clf, .log), "
     "bags of ROS 1 and 2 with scans or clouds (.bag, .mcap, .db3, or the folder of one), "
     "live cameras ('camera:0'), "
@@ -90,9 +94,10 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
         return _bag(file, rig, options)
     if is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
         return None
+    if is_pcap(file):
+        return PcapSource(file, _beside(file, rig), options)
     if is_cloud(file):
-        rig = rig_beside([file.with_name("rig.yaml")]) if rig is None else load_rig(rig)
-        return CloudSource(file, rig, options)
+        return CloudSource(file, _beside(file, rig), options)
     words = set(beginnings(file))
     for kinds, kind in ((MESSAGES, CarmenSource), (WORDS, PlainLogSource)):
         if words & kinds:
@@ -102,6 +107,10 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
         found = f"'{next(iter(words))[:20]}'" if words else "nothing"
         raise InputError(f"{file}: is no laser log: no line begins with FLASER (found {found})")
     return None
+
+
+def _beside(file: Path, rig: Rig | str | Path | None) -> Rig | None:
+    return rig_beside([file.with_name("rig.yaml")]) if rig is None else load_rig(rig)
 
 
 def _bag(path: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
