@@ -7,7 +7,9 @@ import pytest
 
 from odomap.errors import ConfigError
 from odomap.lidar.deskew import deskew
-from odomap.simulation.solids import KINDS
+from odomap.simulation.solidcast import cast
+from odomap.simulation.solids import KINDS, Ground, SolidsBuilder
+from odomap.simulation.sweeptruth import edges_of
 from odomap.simulation.sweepworld import SweepSpec, SweepWorld
 from odomap.sources.open import open as open_source
 
@@ -233,3 +235,77 @@ def test_names_make_worlds() -> None:
 def test_what_cannot_be_is_refused(wrong: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         SweepSpec(**wrong)  # type: ignore[arg-type]
+
+
+def flat_part(world: SweepWorld, surfaces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return (N,) how far points are from the nearest side of their rectangle; NaN of others."""
+    row = world.solids.shapes[np.maximum(surfaces, 0)]
+    nearest = np.full(len(points), np.nan)
+    flat = (surfaces >= 0) & (world.solids.forms[np.maximum(surfaces, 0)] == 0)
+    sides = []
+    for first, size in ((4, 12), (8, 13)):
+        along = (row[:, first : first + 3] * points).sum(1) - row[:, first + 3]
+        sides.append(np.minimum(along, row[:, size] - along))
+    nearest[flat] = np.minimum(*sides)[flat]
+    return nearest
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_edges_are_where_surfaces_end(seed: int) -> None:
+    world = SweepWorld(SweepSpec("street", seed, 100, beams=32, columns=1800, noise=0.0))
+    cloud, truth = world.frame(60).cloud, world.sweep_truth(60)
+    assert cloud is not None
+    assert cloud.times is not None
+    assert cloud.beams is not None
+    points = in_world(world, 60, cloud.points, cloud.times)
+    away = flat_part(world, truth.surfaces, points)
+    # How far it is to the next point of the same beam on the same surface.
+    step = np.full(len(points), np.inf)
+    for beam in range(32):
+        rows = np.flatnonzero(cloud.beams == beam)
+        gap = np.linalg.norm(np.diff(points[rows], axis=0), axis=1)
+        gap[np.diff(truth.surfaces[rows]) != 0] = np.inf
+        step[rows] = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
+    built = np.isfinite(step) & np.isfinite(away) & (truth.kinds != KINDS.index("ground"))
+    edges = truth.is_edge & built
+    assert edges.sum() > 300
+    # Two points at most lie between an edge and the side of its rectangle, but where another
+    # thing stands on or cuts into it.
+    assert np.mean(away[edges] < 2.1 * step[edges] + 1e-9) > 0.75
+    # In the middle of a surface there is no edge.
+    inner = built & (away > 6 * step) & ~truth.is_hidden
+    assert inner.sum() > 1000
+    assert truth.is_edge[inner].mean() < 0.08
+    # Poles and trunks end on both sides: from afar all of one is within two beams of an end, but
+    # for those in leaves.
+    round_ = (truth.surfaces >= 0) & (world.solids.forms[np.maximum(truth.surfaces, 0)] == 1)
+    round_ &= np.linalg.norm(cloud.points, axis=1) > 40
+    assert (truth.is_edge | truth.is_hidden)[round_].mean() > 0.8
+    assert not (truth.is_edge & (truth.kinds == KINDS.index("leaves"))).any()
+
+
+def test_a_box_before_a_wall_has_edges_and_the_wall_goes_on_behind_it() -> None:
+    builder = SolidsBuilder(np.random.default_rng(0), Ground.none())
+    builder.box(np.array([5.0, 0.0, 0.0]), (1.0, 2.0, 4.0), "furniture")
+    x, y, z = np.eye(3)
+    builder.rectangle(np.array([8.0, -6.0, -3.0]), y, z, (12.0, 6.0), "building")
+    builder.rectangle(np.array([0.0, -6.0, -3.0]), x, z, (8.0, 6.0), "building")
+    angle = np.linspace(-1.2, 1.2, 2400)
+    beams = np.column_stack([np.cos(angle), np.sin(angle), np.full(2400, 1e-6)])[:, None]
+    distance, hit, normals = cast(
+        builder.build(), np.tile(np.eye(4), (2400, 1, 1)), np.zeros(2400), beams,
+        np.zeros((2400, 1), np.float32), 0.0, 50.0,
+    )  # fmt: skip
+    edge, hidden = (x[:, 0] for x in edges_of(distance, hit, normals, 2, 0.8))
+    # The corners of the box and that of the walls are felt by two beams on either side, and where
+    # the wall ends and nothing is behind it there is an edge, too.
+    box, corner = np.arctan2(1.0, 4.5), np.arctan2(-6.0, 8.0)
+    step = angle[1] - angle[0]
+    on_box = np.abs(np.abs(angle) - box + 1e-9) - 1e-9 < 2 * step
+    on_box &= np.abs(angle) < box
+    at_corner = np.abs(angle - corner) < 2 * step
+    at_corner |= (angle < -corner) & (angle > -corner - 2 * step)
+    np.testing.assert_array_equal(edge, on_box | at_corner)
+    behind = (np.abs(angle) > box) & (np.abs(angle) < box + 2 * step)
+    np.testing.assert_array_equal(hidden, behind)
+    np.testing.assert_allclose(distance[edge & ~at_corner, 0], 4.5 / np.cos(angle[on_box]), 1e-9)

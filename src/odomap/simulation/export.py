@@ -1,10 +1,19 @@
-"""Write a world to disk in the EuRoC ASL layout, so that other systems can run on the same images.
+"""Write a world to disk as data sets are, so that other systems can run on the same measurements.
+
+EuRoC's ASL layout for cameras:
 
     mav0/cam0, cam1    data.csv, sensor.yaml, data/<stamp>.png
     mav0/imu0          data.csv, sensor.yaml
     mav0/state_groundtruth_estimate0/data.csv      p, q (wxyz), v, biases (zero) of the body
 
-Images are lossless; numbers are written with their full precision.
+Images are lossless; numbers are written with their full precision. And KITTI's for a LiDAR:
+
+    velodyne/000000.bin ...     x y z intensity as float32, beam after beam, the highest first,
+                                each from straight ahead to the left and around
+    times.txt                   seconds, when the LiDAR looks ahead
+    poses_velodyne.txt          T_world_lidar then
+
+which has no times of points: they follow from the azimuth.
 """
 
 from pathlib import Path
@@ -16,9 +25,10 @@ from odomap.errors import InputError, OutputError
 from odomap.geometry.pose import SE3
 from odomap.sensors.frame import ImuSamples
 from odomap.sensors.rig import CameraMount, ImuMount
-from odomap.simulation.world import World
+from odomap.simulation.sweepworld import SweepWorld
+from odomap.simulation.world import START_NS, World
 
-__all__ = ["export_euroc"]
+__all__ = ["export_euroc", "export_velodyne"]
 
 TRUTH_HEADER = (
     "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
@@ -73,6 +83,48 @@ def export_euroc(world: World, folder: str | Path) -> Path:
             _write(root / "mav0/imu0/sensor.yaml", _imu_yaml(world.rig.imu))
             _write(root / "mav0/imu0/data.csv", _imu_csv(samples))
         _write(root / "mav0/state_groundtruth_estimate0/data.csv", _truth_csv(world))
+    except OSError as error:
+        reason = error.strerror or error
+        raise OutputError(f"{error.filename or root}: cannot be written: {reason}") from error
+    return root
+
+
+def export_velodyne(world: SweepWorld, folder: str | Path) -> Path:
+    """Write all sweeps of a world into a folder.
+
+    Args:
+        world: with a rotating LiDAR.
+        folder: is made if it is not there.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: the LiDAR does not rotate, so that nothing would say when a point was seen.
+        OutputError: something cannot be written.
+    """
+    if world.spec.pattern != "rotating":
+        raise InputError(
+            "export_velodyne: times of a solid-state LiDAR have no place in this format: "
+            "take pattern=rotating"
+        )
+    root = Path(folder)
+    begun = np.asarray(world.truth.stamps_ns - START_NS, np.float64) * 1e-9
+    ahead = begun + 0.5 / world.spec.rate_hz
+    try:
+        for index in range(len(world)):
+            sweep = world.frame(index).cloud
+            assert sweep is not None
+            assert sweep.intensities is not None
+            assert sweep.beams is not None
+            azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) % (2 * np.pi)
+            rows = np.lexsort([azimuth, -sweep.beams.astype(np.int64)])
+            table = np.column_stack([sweep.points, sweep.intensities / 255.0])[rows]
+            _write(root / f"velodyne/{index:06d}.bin", table.astype("<f4").tobytes())
+        _write(root / "times.txt", "".join(f"{time:.9e}\n" for time in ahead))
+        Ts = world.path.at(ahead).Ts_world_body[:, :3].reshape(-1, 12)
+        lines = (" ".join(repr(float(x)) for x in row) + "\n" for row in Ts)
+        _write(root / "poses_velodyne.txt", "".join(lines))
     except OSError as error:
         reason = error.strerror or error
         raise OutputError(f"{error.filename or root}: cannot be written: {reason}") from error

@@ -23,9 +23,12 @@ from odomap.simulation.path import Path
 from odomap.simulation.rays import cast_kernel
 from odomap.simulation.scene import Scene
 
-__all__ = ["LidarNoise", "scan", "sweep"]
+__all__ = ["RINGS", "LidarNoise", "scan", "sweep"]
 
 Array = NDArray[np.float64]
+
+RINGS = 32
+"""Beams above each other, where nothing else is said."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def scan(
 
 def sweep(
     scene: Scene, path: Path, mount: LidarMount, time: float, noise: LidarNoise,
-    rng: np.random.Generator, *, rings: int = 32, columns: int = 900,
+    rng: np.random.Generator, *, rings: int = RINGS, columns: int = 900,
     elevations_deg: tuple[float, float] = (-25.0, 10.0),
 ) -> Sweep:  # fmt: skip
     """Take one 3D sweep that starts at a time.

@@ -196,7 +196,7 @@ def _measure_kernel(
             if r < noise[4]:
                 continue
             points[count, 0], points[count, 1], points[count, 2] = r * x, r * y, r * z
-            intensities[count] = 255.0 * albedos[s, b] * cosine
+            intensities[count] = 255.0 * albedos[s, b] * max(cosine, 0.0)
             rows[count] = s * beams + b
             count += 1
     return count

@@ -31,6 +31,7 @@ from odomap.simulation.scanner import PATTERNS, Measured, Scanner, measure
 from odomap.simulation.solidcast import GROUND, cast
 from odomap.simulation.solidrooms import solid_building, solid_room
 from odomap.simulation.solids import ALBEDO, Solids
+from odomap.simulation.sweeptruth import SweepTruth, edges_of
 from odomap.simulation.town import field, town, tunnel
 from odomap.simulation.world import START_NS
 
@@ -124,34 +125,6 @@ class SweepSpec:
         )
 
 
-@dataclass(frozen=True)
-class SweepTruth:
-    """What the points of a sweep show, row by row.
-
-    Attributes:
-        points: (N, 3) without noise, in the LiDAR's frame at the moment of each.
-        surfaces: (N,) the surface: a row of the world's shapes, or -2 for the ground.
-        things: (N,) what it is a part of, such as one house or one car; 0 for the ground.
-        kinds: (N,) index of `solids.KINDS`.
-        normals: (N, 3) of the surface, towards the LiDAR, in its frame at the moment of each; NaN
-            of leaves.
-        is_ground: (N,) whether one could drive or walk on it.
-        is_edge: (N,) whether the surface ends beside the point, seen along its line of beams: it
-            stands before what is beside it, or bends there; never of leaves.
-        is_hidden: (N,) whether what ends beside the point is what stands before it: such an end is
-            no edge of anything, and moves with the LiDAR.
-    """
-
-    points: Array
-    surfaces: NDArray[np.int32]
-    things: NDArray[np.int64]
-    kinds: NDArray[np.int64]
-    normals: Array
-    is_ground: NDArray[np.bool_]
-    is_edge: NDArray[np.bool_]
-    is_hidden: NDArray[np.bool_]
-
-
 class SweepWorld:
     """Solids seen by a moving LiDAR, with known truth.
 
@@ -214,7 +187,7 @@ class SweepWorld:
             IndexError: there is no such frame.
         """
         measured, directions, distance, hit, normals, R_world_lidar = self._measured(index)
-        edge, hidden = _edges(distance, hit, normals, reach, np.cos(np.radians(bend_deg)))
+        edge, hidden = edges_of(distance, hit, normals, reach, np.cos(np.radians(bend_deg)))
         rows = measured.rows
         who = hit.ravel()[rows]
         local = np.einsum("sij,sbi->sbj", R_world_lidar, normals)
@@ -262,34 +235,3 @@ class SweepWorld:
             LidarNoise().scaled(self.spec.noise), rng,
         )  # fmt: skip
         return measured, directions, distance, hit, normals, R_world_lidar
-
-
-def _edges(
-    distance: Array, hit: NDArray[np.int32], normals: Array, reach: int, bend: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return (S, B) whether a surface ends or bends beside a beam, and whether it is hidden there.
-
-    A jump is where the next beam along the line ends on another surface farther than the slope of
-    neither explains; the nearer side has the edge, the farther side is hidden.
-    """
-    edge, hidden = np.zeros(hit.shape, np.bool_), np.zeros(hit.shape, np.bool_)
-    # Leaves have neither, but what is before or behind them does.
-    other = hit[1:] != hit[:-1]
-    step = distance[1:] - distance[:-1]
-    nearer = np.minimum(distance[1:], distance[:-1])
-    # Where nothing returned the surface ends, too, but nobody knows at what.
-    jump = other & (np.abs(step) > 0.1 + 0.02 * nearer)
-    with np.errstate(invalid="ignore"):
-        cosine = (normals[1:] * normals[:-1]).sum(axis=2)
-        fold = other & ~jump & (cosine < bend)
-    for k in range(reach):
-        for before in (True, False):
-            # Beams k steps from the border, on the side before it or behind it.
-            rows = slice(0, len(step) - k) if before else slice(k + 1, None)
-            at = slice(k, None) if before else slice(0, len(step) - k)
-            has_edge = fold[at] | (jump[at] & ((step[at] > 0) == before))
-            same = hit[rows] == (hit[:-1] if before else hit[1:])[at]
-            edge[rows] |= has_edge & same
-            hidden[rows] |= jump[at] & ((step[at] > 0) != before) & same
-    is_surface = ~np.isnan(normals[:, :, 0])
-    return edge & is_surface, hidden & is_surface

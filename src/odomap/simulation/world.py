@@ -25,7 +25,7 @@ from odomap.sensors.sweep import Sweep
 from odomap.simulation.building import building, corridor
 from odomap.simulation.exposure import ImageNoise, expose, measure_depth
 from odomap.simulation.imu import imu_samples
-from odomap.simulation.lidar import LidarNoise, scan, sweep
+from odomap.simulation.lidar import RINGS, LidarNoise, scan, sweep
 from odomap.simulation.path import Path
 from odomap.simulation.render import render
 from odomap.simulation.room import R_CARRIER_IMU, room
@@ -340,7 +340,9 @@ def _lidar_mounts(spec: WorldSpec, R_imu_carrier: Array) -> tuple[LidarMount, ..
             ),
         )
     if "lidar3d" in spec.sensors:
-        return (LidarMount("top", T_imu_lidar, (0.4, 100.0), spec.rate_hz, "clockwise"),)
+        return (
+            LidarMount("top", T_imu_lidar, (0.4, 100.0), spec.rate_hz, "clockwise", beams=RINGS),
+        )
     return ()
 
 
