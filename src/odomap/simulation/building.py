@@ -75,24 +75,26 @@ def building(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]
     Returns:
         The scene, and the path of the body; the floor is z = 0, metres.
     """
-    builder, path = furnished_building(seed, moving_objects, speed, SceneBuilder)
-    return builder.build(), path
+    builder, way = furnished_building(seed, moving_objects, SceneBuilder)
+    scene = builder.build()  # draws numbers, too
+    return scene, hand_held(way, speed, builder.rng, R_CARRIER_IMU)
 
 
 def furnished_building(
-    seed: int, moving_objects: int, speed: float, make: type[Builder]
-) -> tuple[Builder, Path]:
-    """Return what a building is made of, collected by a builder of some type; as `building`."""
+    seed: int, moving_objects: int, make: type[Builder]
+) -> tuple[Builder, Array]:
+    """Return what a building is made of, in a builder of some type, and way points round it."""
     rng = np.random.default_rng([seed, 3])
     length = float(rng.uniform(17.0, 20.0))
-    return _made(rng, length, 40, moving_objects, speed, make, is_alike=False)
+    return _made(rng, length, 40, moving_objects, make, is_alike=False)
 
 
 def corridor(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     """Make a long corridor of identical doors, and walk round; as `building`."""
     rng = np.random.default_rng([seed, 4])
-    builder, path = _made(rng, 24.0, 2, moving_objects, speed, SceneBuilder, is_alike=True)
-    return builder.build(), path
+    builder, way = _made(rng, 24.0, 2, moving_objects, SceneBuilder, is_alike=True)
+    scene = builder.build()
+    return scene, hand_held(way, speed, rng, R_CARRIER_IMU)
 
 
 def _made(
@@ -100,11 +102,10 @@ def _made(
     length: float,
     posters: int,
     moving_objects: int,
-    speed: float,
     make: type[Builder],
     is_alike: bool,
-) -> tuple[Builder, Path]:
-    """Build walls round a ring `length` m long and 60 m round, and walk it."""
+) -> tuple[Builder, Array]:
+    """Build walls round a ring `length` m long and 60 m round, and return the way along it."""
     radius = HALF_WIDTH
     width = ROUND_M / 2 - length + (4 - np.pi) * radius
     ring = Ring(length, width, radius)
@@ -122,8 +123,7 @@ def _made(
         _trolley(builder, ring)
     way = ring.way(0.0, EYES_M, 0.75)
     way[:, 2] += rng.uniform(-0.05, 0.05)
-    way = way if rng.random() < 0.5 else way[::-1]
-    return builder, hand_held(way, speed, rng, R_CARRIER_IMU)
+    return builder, way if rng.random() < 0.5 else way[::-1]
 
 
 def _bays(ring: Ring, outside: bool) -> list[_Bay]:

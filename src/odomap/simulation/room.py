@@ -14,7 +14,7 @@ from odomap.simulation.light import Lights
 from odomap.simulation.path import Harmonics, Path, closed_route, hand_held
 from odomap.simulation.scene import Scene, SceneBuilder
 
-__all__ = ["R_CARRIER_IMU", "furnished_room", "room"]
+__all__ = ["R_CARRIER_IMU", "furnished_room", "room", "walk_round"]
 
 Array = NDArray[np.float64]
 Builder = TypeVar("Builder", bound=SceneBuilder)
@@ -34,14 +34,13 @@ def room(seed: int, moving_objects: int, speed: float) -> tuple[Scene, Path]:
     Returns:
         The scene, and the path of the body; the floor is z = 0, metres.
     """
-    builder, path = furnished_room(seed, moving_objects, speed, SceneBuilder)
-    return builder.build(), path
+    builder, radii = furnished_room(seed, moving_objects, SceneBuilder)
+    scene = builder.build()  # draws numbers, too
+    return scene, walk_round(builder.rng, radii, speed)
 
 
-def furnished_room(
-    seed: int, moving_objects: int, speed: float, make: type[Builder]
-) -> tuple[Builder, Path]:
-    """Return what a room is made of, collected by a builder of some type; as `room`."""
+def furnished_room(seed: int, moving_objects: int, make: type[Builder]) -> tuple[Builder, Array]:
+    """Return what a room is made of, in a builder of some type, and (2,) radii of the way in it."""
     rng = np.random.default_rng([seed, 1])
     half = np.array([rng.uniform(3.2, 4.6), rng.uniform(2.6, 3.6)])
     height = float(rng.uniform(2.6, 3.1))
@@ -55,7 +54,7 @@ def furnished_room(
     radii = half - 1.35
     for _ in range(moving_objects):
         _wanderer(builder, radii)
-    return builder, _walk(rng, radii, speed)
+    return builder, radii
 
 
 def _shell(builder: SceneBuilder, half: Array, height: float) -> None:
@@ -183,8 +182,8 @@ def _wanderer(builder: SceneBuilder, radii: Array) -> None:
     builder.box(np.array([0, 0, size[2] / 2]), size, poster, mover=number)
 
 
-def _walk(rng: np.random.Generator, radii: Array, speed: float) -> Path:
-    """Go round the middle at eye level."""
+def walk_round(rng: np.random.Generator, radii: Array, speed: float) -> Path:
+    """Go round the middle of a room at eye level."""
     angles = np.arange(10) * (2 * np.pi / 10) + rng.uniform(0, 2 * np.pi)
     stretch = rng.uniform(0.92, 1.06, (10, 1))
     ring = np.column_stack([np.cos(angles), np.sin(angles)]) * radii * stretch

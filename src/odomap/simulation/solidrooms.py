@@ -15,8 +15,8 @@ from types import MappingProxyType
 import numpy as np
 
 from odomap.simulation.building import furnished_building
-from odomap.simulation.path import Path
-from odomap.simulation.room import furnished_room
+from odomap.simulation.path import Path, hand_held
+from odomap.simulation.room import furnished_room, walk_round
 from odomap.simulation.scene import BareBuilder
 from odomap.simulation.solids import Ground, Solids, SolidsBuilder
 
@@ -44,15 +44,18 @@ def solid_room(seed: int, moving_objects: int, speed: float) -> tuple[Solids, Pa
     Returns:
         What is there, and the path of the LiDAR; the floor is z = 0, metres.
     """
-    return _solid(*furnished_room(seed, moving_objects, speed, BareBuilder))
+    builder, radii = furnished_room(seed, moving_objects, BareBuilder)
+    return _solid(builder), replace(walk_round(builder.rng, radii, speed), R_carrier_body=np.eye(3))
 
 
 def solid_building(seed: int, moving_objects: int, speed: float) -> tuple[Solids, Path]:
     """Furnish corridors and rooms, and walk round; as `solid_room`."""
-    return _solid(*furnished_building(seed, moving_objects, speed, BareBuilder))
+    builder, way = furnished_building(seed, moving_objects, BareBuilder)
+    return _solid(builder), hand_held(way, speed, builder.rng, np.eye(3))
 
 
-def _solid(bare: BareBuilder, path: Path) -> tuple[Solids, Path]:
+def _solid(bare: BareBuilder) -> Solids:
+    """Return what a builder collected."""
     builder = SolidsBuilder(bare.rng, Ground.none())
     for mover in bare.movers:
         builder.mover(mover)
@@ -67,4 +70,4 @@ def _solid(bare: BareBuilder, path: Path) -> tuple[Solids, Path]:
             frame[:3], frame[3:6], frame[6:9], (face[0], face[1]), kind,
             albedo=ALBEDO.get(bare.materials[code[0]], 0.4), mover=int(mover), is_ground=is_floor,
         )  # fmt: skip
-    return builder.build(), replace(path, R_carrier_body=np.eye(3))
+    return builder.build()
