@@ -11,9 +11,8 @@ from odomap.files.mapfile import load_map, save_map
 from odomap.geometry.planar import between_planar, from_plane, lift_information, to_plane
 from odomap.maps.edges import FOLDED, LOOP, EdgeTable
 from odomap.system.config import preset
-from odomap.system.redundancy import ScanMap
+from odomap.system.edgefolding import folded_ties
 from odomap.system.scanconfig import ScanThinningConfig, SubmapConfig
-from odomap.system.scanthinning import _ties
 from odomap.system.slam import Slam
 from odomap.system.submaps import SUBMAP
 
@@ -143,10 +142,7 @@ def test_only_what_would_fall_apart_is_tied(is_tied):
         lift_information(np.tile(np.diag([4.0, 4.0, 9.0]), (count, 1, 1))),
         (SUBMAP, SUBMAP, LOOP, FOLDED)[:count],
     )
-    read = ScanMap((), np.zeros(0, np.int64), set(), np.arange(4), x, {}, edges, np.zeros(4))
-    ids, left = np.array([1, 2]), np.array([0, 3])
-    is_gone = np.isin(i, ids) | np.isin(j, ids)
-    tied = _ties(read, ids, is_gone, ~is_gone, left)
+    tied = folded_ties(edges, np.arange(4), from_plane(x), np.array([1, 2]), "SE2")
     if is_tied:
         assert tied.kind == ()
         return

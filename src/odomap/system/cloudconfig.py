@@ -92,7 +92,7 @@ class CloudThinningConfig:
 
     enabled: bool = True
     """Whether any go: a map then grows with the space seen, and not with time."""
-    near: Positive = 8.0
+    near: Positive = 6.0
     """How near older keyframes must be that show what one shows, metres."""
     covers: Count = 2
     """How many of them must be so near."""
@@ -100,7 +100,7 @@ class CloudThinningConfig:
     """Side of the voxels in which clouds are compared, metres."""
     within: Positive = 30.0
     """How far a cloud is compared: beyond, points are few, and far apart; metres."""
-    share: Fraction = 0.9
+    share: Fraction = 0.95
     """Share of a cloud's voxels that older ones must show for its keyframe to go."""
     settled: Count = 20
     """Newest keyframes that stay: the path through them is not settled yet."""

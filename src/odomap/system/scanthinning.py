@@ -4,11 +4,9 @@ A robot that goes round the same building all day adds submap after submap of wh
 go that are redundant (`redundancy`); the oldest stay, which have been tied to most others.
 
 With a redundant submap the keyframes go that are in no other, and all edges to them, but where
-nothing else ties what is left together: there they are folded into the surest edge that does
-(`backend/graphs/folding`). To keep all they said would make the path surer than it is, and worse:
-matches of many scans to the same walls are not independent. Frames that hung from
-these keyframes hang from the nearest of the older ones from then on. So poses and covariances stay
-as they are, and later corrections move all that lies together.
+nothing else ties what is left together (`edgefolding`). Frames that hung from these keyframes hang
+from the nearest of the older ones from then on. So poses and covariances stay as they are, and
+later corrections move all that lies together.
 
 Only submaps are looked at that are new, and one of the others in turn, since what is close to what
 may have been corrected. Cost: some milliseconds per submap.
@@ -17,27 +15,17 @@ Reference: H. Kretzschmar, C. Stachniss, "Information-theoretic compression of p
 laser-based SLAM", International Journal of Robotics Research 31(11), 2012.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.graphs.components import connected_components
-from odomap.backend.graphs.folding import fold
-from odomap.backend.graphs.posegraph import PoseGraph
-from odomap.geometry.lie import se3_inverse
-from odomap.geometry.planar import (
-    IN_PLANE,
-    from_plane,
-    lift_information,
-    planar_matrix,
-    to_plane,
-)
-from odomap.geometry.se2 import se2_log
+from odomap.geometry.planar import from_plane, to_plane
 from odomap.lidar.scans import Beams
-from odomap.maps.edges import FOLDED, GAP, LOOP, EdgeTable
+from odomap.maps.edges import FOLDED, GAP, EdgeTable
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
+from odomap.system.edgefolding import folded_ties, joined_edges, with_kind
 from odomap.system.redundancy import ScanMap, redundant
 from odomap.system.scanconfig import ScanThinningConfig
 from odomap.system.stages import Change, Closer, Job, Loop
@@ -47,14 +35,11 @@ __all__ = ["ScanThinner"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 NEW, IN_TURN = 3, 1
 """Submaps that are looked at: so many of the newest, and of the others."""
 RECENT = 1
 """Submaps that are not, since the path through them is not settled yet."""
-DOUBTED = 10.0
-"""Standard deviations by which a loop contradicts the path that does not believe it."""
 
 
 class ScanThinner:
@@ -187,8 +172,8 @@ def _plan(read: ScanMap, gone: list[Submap]) -> _Plan:
     between = np.isin(edges.i, left) & np.isin(edges.j, left)
     renamed = (kinds == SUBMAP) & np.isin(edges.i, list(anchors)) & between
     holders = [_holder(read, k, left) for k in ids.tolist()]
-    new = _with_kind(edges, np.flatnonzero(renamed), FOLDED)
-    new = _joined(new, _ties(read, ids, is_gone, between, left))
+    new = with_kind(edges, np.flatnonzero(renamed), FOLDED)
+    new = joined_edges(new, folded_ties(edges, read.ids, from_plane(read.x), ids, "SE2"))
     return _Plan(ids, np.array(holders, np.int64), np.flatnonzero(is_gone | renamed), new)
 
 
@@ -198,100 +183,3 @@ def _holder(read: ScanMap, k: int, left: Index) -> int:
     older = older[read.pieces[read.rows(older)] == read.pieces[read.rows([k])]]
     apart = np.linalg.norm(read.x[read.rows(older), :2] - read.place(k)[:2], axis=1)
     return int(older[apart.argmin()])
-
-
-def _ties(read: ScanMap, ids: Index, is_gone: Bool, between: Bool, left: Index) -> EdgeTable:
-    """Return what ties together what would fall apart without keyframes.
-
-    Args:
-        read: of the map.
-        ids: of these keyframes.
-        is_gone: (E,) edges to them.
-        between: (E,) edges between others.
-        left: ids of the others.
-    """
-    edges = read.edges
-    alive = np.isin(edges.i, read.ids) & np.isin(edges.j, read.ids)
-    believed = _is_believed(read, alive)
-    stay = between & believed & (edges.information[:, 0, 0] > 0.0)
-    parts = connected_components(
-        len(left), np.searchsorted(left, edges.i[stay]), np.searchsorted(left, edges.j[stay])
-    )
-    used = np.flatnonzero(is_gone & alive & believed)
-    around = np.setdiff1d(np.r_[edges.i[used], edges.j[used]], ids)
-    if len(np.unique(parts[np.searchsorted(left, around)])) < 2:
-        return _with_kind(edges, used[:0], FOLDED)
-    nodes = np.union1d(around, np.r_[edges.i[used], edges.j[used]])
-    graph = PoseGraph(
-        "SE2",
-        planar_matrix(read.x[read.rows(nodes)]),
-        np.searchsorted(nodes, edges.i[used]),
-        np.searchsorted(nodes, edges.j[used]),
-        planar_matrix(to_plane(edges.Ts_i_j[used])),
-        edges.information[used][:, IN_PLANE[:, None], IN_PLANE],
-    )
-    tree = fold(graph, np.isin(nodes, ids))
-    i, j = nodes[tree.first], nodes[tree.second]
-    ends = np.searchsorted(left, i), np.searchsorted(left, j)
-    chosen = _joining(parts, *ends, np.linalg.slogdet(tree.information)[1])
-    x = np.column_stack([
-        tree.Ts_first_second[chosen, :2, 2],
-        np.arctan2(tree.Ts_first_second[chosen, 1, 0], tree.Ts_first_second[chosen, 0, 0]),
-    ])  # fmt: skip
-    return EdgeTable(
-        i[chosen],
-        j[chosen],
-        from_plane(x),
-        np.ones(len(chosen)),
-        lift_information(tree.information[chosen]),
-        (FOLDED,) * len(chosen),
-    )
-
-
-def _joining(parts: Index, i: Index, j: Index, sure: Array) -> Index:
-    """Return the rows of the surest edges that make one of parts (N,) of a graph."""
-    parts, chosen = parts.copy(), []
-    for row in np.argsort(-sure, kind="stable").tolist():
-        a, b = parts[i[row]], parts[j[row]]
-        if a != b:
-            parts[parts == b] = a
-            chosen.append(row)
-    return np.array(chosen, np.int64)
-
-
-def _is_believed(read: ScanMap, chosen: Bool) -> Bool:
-    """Say of each edge (E,) whether the path does not contradict it; only loops may be."""
-    edges, kinds = read.edges, np.array(read.edges.kind, str)
-    rows = np.flatnonzero(chosen & (kinds == LOOP))
-    Ts = from_plane(read.x)
-    between = se3_inverse(Ts[read.rows(edges.i[rows])]) @ Ts[read.rows(edges.j[rows])]
-    off = se2_log(planar_matrix(to_plane(se3_inverse(edges.Ts_i_j[rows]) @ between)))
-    information = edges.information[rows][:, IN_PLANE[:, None], IN_PLANE]
-    believed = np.ones(len(kinds), np.bool_)
-    believed[rows] = np.einsum("ni,nij,nj->n", off, information, off) < DOUBTED**2
-    return believed
-
-
-def _with_kind(edges: EdgeTable, rows: Index, kind: str) -> EdgeTable:
-    """Return some edges, as those of another kind."""
-    return replace(
-        edges,
-        i=edges.i[rows],
-        j=edges.j[rows],
-        Ts_i_j=edges.Ts_i_j[rows],
-        scales_i_j=edges.scales_i_j[rows],
-        information=edges.information[rows],
-        kind=(kind,) * len(rows),
-    )
-
-
-def _joined(a: EdgeTable, b: EdgeTable) -> EdgeTable:
-    """Return the edges of both."""
-    return EdgeTable(
-        np.concatenate([a.i, b.i]),
-        np.concatenate([a.j, b.j]),
-        np.concatenate([a.Ts_i_j, b.Ts_i_j]),
-        np.concatenate([a.scales_i_j, b.scales_i_j]),
-        np.concatenate([a.information, b.information]),
-        (*a.kind, *b.kind),
-    )
