@@ -17,10 +17,13 @@ def make(kind: str, seed: int) -> Path:
     rng = np.random.default_rng(seed)
     if kind == "hand":
         return hand_held(ring(2.0), 0.6, rng, R_CARRIER_IMU)
-    return vehicle(ring(60.0, 60), 7.5, rng, np.eye(3))
+    way = ring(60.0, 60)
+    if kind == "hills":
+        way[:, 2] += 2.0 * np.sin(np.arange(60) * 2 * np.pi / 15)
+    return vehicle(way, 7.5, rng, np.eye(3), climbs=kind == "hills")
 
 
-@pytest.mark.parametrize("kind", ["hand", "wheels"])
+@pytest.mark.parametrize("kind", ["hand", "wheels", "hills"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_velocity_acceleration_and_rate_are_derivatives(kind: str, seed: int) -> None:
     path = make(kind, seed)
@@ -50,6 +53,15 @@ def test_speed_is_that_of_a_walker_or_a_car(kind: str, low: float, high: float) 
         speed = np.linalg.norm(motion.v_world_body, axis=1)
         assert low < np.percentile(speed, 2)
         assert np.percentile(speed, 98) < high
+
+
+def test_what_climbs_looks_along_the_road() -> None:
+    motion = make("hills", 2).at(np.linspace(0.0, 50.0, 500))
+    ahead, speed = motion.Ts_world_body[:, :3, 0], motion.v_world_body
+    slopes = [np.arctan2(x[:, 2], np.hypot(x[:, 0], x[:, 1])) for x in (ahead, speed)]
+    assert np.ptp(slopes[1]) > 0.2
+    assert np.corrcoef(*slopes)[0, 1] > 0.98
+    assert np.abs(slopes[0] - slopes[1]).max() < 0.05
 
 
 def test_the_route_closes_and_comes_back() -> None:

@@ -1,6 +1,7 @@
 """Rays: the tree finds what asking every rectangle finds."""
 
 import numpy as np
+import pytest
 
 from odomap.simulation.rays import BoxTree, cast_kernel
 
@@ -27,13 +28,14 @@ def by_asking_all(o: np.ndarray, d: np.ndarray, frames: np.ndarray, faces: np.nd
     return t.min(1), np.where(hit.any(1), t.argmin(1), -1)
 
 
-def test_the_tree_agrees_with_asking_every_rectangle() -> None:
+@pytest.mark.parametrize("by_area", [False, True])
+def test_the_tree_agrees_with_asking_every_rectangle(by_area: bool) -> None:
     rng = np.random.default_rng(0)
     frames, faces = random_rectangles(rng, 300)
     c, a = frames[:, :3], frames[:, 3:6] * faces[:, :1]
     b = frames[:, 6:] * faces[:, 1:2]
     still = np.arange(280)
-    tree = BoxTree.of(np.stack([c, c + a, c + a + b, c + b], 1)[still])
+    tree = BoxTree.of(np.stack([c, c + a, c + a + b, c + b], 1)[still], by_area=by_area)
     movers = np.arange(280, 300)
     velocities = rng.standard_normal((20, 3))
     origins, directions = rng.uniform(-6, 6, (400, 3)), rng.standard_normal((400, 3))

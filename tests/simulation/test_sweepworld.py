@@ -9,8 +9,9 @@ from odomap.errors import ConfigError
 from odomap.lidar.deskew import deskew
 from odomap.simulation.solidcast import cast
 from odomap.simulation.solids import KINDS, Ground, SolidsBuilder
+from odomap.simulation.sweepspec import SweepSpec
 from odomap.simulation.sweeptruth import edges_of
-from odomap.simulation.sweepworld import SweepSpec, SweepWorld
+from odomap.simulation.sweepworld import SweepWorld
 from odomap.sources.open import open as open_source
 
 SMALL = SweepSpec("street", seed=3, frames=40, beams=16, columns=300)

@@ -7,7 +7,8 @@ import pytest
 
 from odomap.errors import InputError
 from odomap.simulation.export import export_velodyne
-from odomap.simulation.sweepworld import SweepSpec, SweepWorld
+from odomap.simulation.sweepspec import SweepSpec
+from odomap.simulation.sweepworld import SweepWorld
 from odomap.sources.open import open as open_source
 
 

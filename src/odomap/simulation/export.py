@@ -17,6 +17,7 @@ which has no times of points: they follow from the azimuth.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -25,8 +26,10 @@ from odomap.errors import InputError, OutputError
 from odomap.geometry.pose import SE3
 from odomap.sensors.frame import ImuSamples
 from odomap.sensors.rig import CameraMount, ImuMount
-from odomap.simulation.sweepworld import SweepWorld
 from odomap.simulation.world import START_NS, World
+
+if TYPE_CHECKING:
+    from odomap.simulation.sweepworld import SweepWorld
 
 __all__ = ["export_euroc", "export_velodyne"]
 
@@ -89,7 +92,7 @@ def export_euroc(world: World, folder: str | Path) -> Path:
     return root
 
 
-def export_velodyne(world: SweepWorld, folder: str | Path) -> Path:
+def export_velodyne(world: "SweepWorld", folder: str | Path) -> Path:
     """Write all sweeps of a world into a folder.
 
     Args:

@@ -29,13 +29,12 @@ from odomap.kernels import kernel
 from odomap.sensors.sweep import Sweep
 from odomap.simulation.lidar import LidarNoise
 
-__all__ = ["PATTERNS", "Scanner", "measure", "warm_up"]
+__all__ = ["Scanner", "measure", "warm_up"]
 
 Array = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Ids = NDArray[np.int32]
 
-PATTERNS = ("rotating", "solid_state")
 ELEVATIONS = ((16, -15.0, 15.0), (32, -30.0, 10.0), (64, -24.8, 2.0), (1024, -25.0, 15.0))
 """Lowest and highest beam in degrees of a rotating LiDAR of up to so many beams: as a VLP-16, an
 HDL-32, an HDL-64 and a VLS-128 have them."""
@@ -52,7 +51,7 @@ class Scanner:
     """A pattern.
 
     Attributes:
-        pattern: one of `PATTERNS`.
+        pattern: "rotating" or "solid_state".
         beams: above each other.
         columns: steps of a sweep; all beams leave in each.
         period: of a sweep, seconds.

@@ -15,27 +15,27 @@ simulated sweeps).
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import ConfigError, nearest_name
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import LidarMount, Rig
 from odomap.simulation.lidar import LidarNoise
 from odomap.simulation.path import Path
-from odomap.simulation.scanner import PATTERNS, Measured, Scanner, measure
+from odomap.simulation.scanner import Measured, Scanner, measure
 from odomap.simulation.solidcast import GROUND, cast
 from odomap.simulation.solidrooms import solid_building, solid_room
 from odomap.simulation.solids import ALBEDO, Solids
+from odomap.simulation.sweepspec import HAND_HELD, NEAREST_M, SweepSpec
 from odomap.simulation.sweeptruth import SweepTruth, edges_of
 from odomap.simulation.town import field, town, tunnel
 from odomap.simulation.world import START_NS
 
-__all__ = ["SweepSpec", "SweepWorld"]
+__all__ = ["SweepWorld"]
 
 Array = NDArray[np.float64]
 
@@ -48,81 +48,8 @@ MAKERS: Mapping[str, Callable[[int, int, float], tuple[Solids, Path]]] = Mapping
         "field": field,
     }
 )
-HAND_HELD = ("room", "building")
-NEAREST_M = 0.4
-COLUMNS = MappingProxyType({"rotating": 1800, "solid_state": 1500})
 INDOORS = (np.radians(-22.5), np.radians(22.5))
 """View of a rotating LiDAR in rooms, so that floor and ceiling are seen."""
-
-
-@dataclass(frozen=True)
-class SweepSpec:
-    """What decides a world for a 3D LiDAR, to the last byte."""
-
-    kind: str = "street"
-    """"street" (a circuit of 500 to 650 m that rises and falls), "room", "building" (corridors and
-    rooms, 60 m round), both hand-held, "tunnel" (long and featureless) or "field" (flat ground and
-    nothing else)."""
-    seed: int = 0
-    """Which of the worlds of its kind."""
-    frames: int = 0
-    """How many sweeps there are; 0 for as many as the rounds take."""
-    rounds: float = 0.0
-    """How often one goes round, where frames do not say; 0 for 1.15, and in a tunnel for 0.35."""
-    rate_hz: float = 10.0
-    """Sweeps per second."""
-    speed: float = 0.0
-    """Mean speed in m/s; 0 for 0.6 in a room, 0.8 in a building and 7.5 outdoors."""
-    noise: float = 1.0
-    """Factor on all imperfections of the LiDAR; 0 for an ideal one."""
-    beams: int = 32
-    """Above each other, of which as many leave at once."""
-    columns: int = 0
-    """Steps of a sweep; 0 for 1800 of a rotating and 1500 of a solid-state LiDAR."""
-    pattern: str = "rotating"
-    """"rotating", or "solid_state": a rosette of 70 x 77 degrees ahead that never repeats."""
-    range_m: float = 100.0
-    """Beyond this nothing returns."""
-    moving_objects: int = 0
-    """How many cars (in a street), trolleys or cartons move; sixty cars are a fifth of the
-    points."""
-    sensors: tuple[str, ...] = ("lidar3d",)
-    """A 3D LiDAR, always."""
-
-    def __post_init__(self) -> None:
-        for name, known in (("kind", tuple(MAKERS)), ("pattern", PATTERNS)):
-            value = getattr(self, name)
-            if value not in known:
-                names = ", ".join(known)
-                raise ConfigError(
-                    f"{name}: '{value}' is none of {names}{nearest_name(value, known)}"
-                )
-        if self.sensors != ("lidar3d",):
-            raise ConfigError("sensors: a world for a LiDAR has 'lidar3d' alone")
-        for name, low, high in (("beams", 1, 256), ("columns", 0, 20_000)):
-            if not low <= getattr(self, name) <= high:
-                raise ConfigError(f"{name}: {getattr(self, name)} must be from {low} to {high}")
-        for name in ("seed", "frames", "moving_objects"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name}: {getattr(self, name)} must be 0 or more")
-        for name in ("rounds", "speed", "noise"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"{name}: {value} must be finite and not negative")
-        for name in ("rate_hz", "range_m"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > (NEAREST_M if name == "range_m" else 0)):
-                raise ConfigError(f"{name}: {value} must be finite and above 0")
-
-    def completed(self) -> "SweepSpec":
-        """Return the spec with the values that depend on the kind filled in."""
-        walk = 0.6 if self.kind == "room" else 0.8
-        return replace(
-            self,
-            rounds=self.rounds or (0.35 if self.kind == "tunnel" else 1.15),
-            speed=self.speed or (walk if self.kind in HAND_HELD else 7.5),
-            columns=self.columns or COLUMNS[self.pattern],
-        )
 
 
 class SweepWorld:

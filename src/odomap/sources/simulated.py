@@ -17,7 +17,7 @@ images: ``sim:building?sensors=laser&seed=3&rounds=2`` (see `simulation.laserwor
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -27,9 +27,12 @@ from odomap.errors import ConfigError, InputError, OdomapError, nearest_name
 from odomap.geometry.trajectory import Trajectory
 from odomap.sensors.frame import Frame
 from odomap.simulation.laserworld import LaserSpec, LaserWorld
-from odomap.simulation.sweepworld import SweepSpec, SweepWorld
+from odomap.simulation.sweepspec import SweepSpec
 from odomap.simulation.world import World, WorldSpec
 from odomap.sources.source import Skipped
+
+if TYPE_CHECKING:
+    from odomap.simulation.sweepworld import SweepWorld
 
 __all__ = ["SimulatedSource", "is_simulated", "read_spec"]
 
@@ -171,18 +174,14 @@ class SimulatedSource:
 
     def __init__(self, world: Spec | str | Path) -> None:
         spec = read_spec(world) if isinstance(world, str | Path) else world
-        self.world: World | LaserWorld | SweepWorld
+        self.world = _world_of(spec)
         self.odometry: NDArray[np.float64] | None = None
-        self.name = f"sim:{spec.kind}?seed={spec.seed}&frames={spec.frames}"
-        if isinstance(spec, LaserSpec):
-            self.world = LaserWorld(spec)
-            self.odometry = self.world.odometry
-            self.name = f"sim:{spec.kind}?sensors=laser&seed={spec.seed}&frames={len(self.world)}"
+        sensors = ""
+        if isinstance(self.world, LaserWorld):
+            self.odometry, sensors = self.world.odometry, "sensors=laser&"
         elif isinstance(spec, SweepSpec):
-            self.world = SweepWorld(spec)
-            self.name = f"sim:{spec.kind}?sensors=lidar3d&seed={spec.seed}&frames={len(self.world)}"
-        else:
-            self.world = World(spec)
+            sensors = "sensors=lidar3d&"
+        self.name = f"sim:{spec.kind}?{sensors}seed={spec.seed}&frames={len(self.world)}"
         self.rig = self.world.rig
         self.truth: Trajectory | None = self.world.truth
         self.stamps_ns: NDArray[np.int64] = self.world.truth.stamps_ns
@@ -199,3 +198,14 @@ class SimulatedSource:
         self.skipped = []
         for index in range(len(self.world)):
             yield self.world.frame(index)
+
+
+def _world_of(spec: Spec) -> "World | LaserWorld | SweepWorld":
+    if isinstance(spec, LaserSpec):
+        return LaserWorld(spec)
+    if isinstance(spec, SweepSpec):
+        # Imported where needed: who looks at pictures shall not wait until its kernels compile.
+        from odomap.simulation.sweepworld import SweepWorld
+
+        return SweepWorld(spec)
+    return World(spec)
