@@ -73,6 +73,40 @@ def test_raw_drive(tmp_path: Path) -> None:
         odomap.open(tmp_path / "drive")
 
 
+def test_truth_of_a_raw_drive(tmp_path: Path) -> None:
+    """A car goes north-east at 10 m/s, its GPS 1 m behind and 0.5 m below the LiDAR."""
+    write_velodyne(tmp_path)
+    drive = tmp_path / "day" / "drive"
+    (drive / "velodyne_points").mkdir(parents=True)
+    (tmp_path / "velodyne").rename(drive / "velodyne_points" / "data")
+    lines = [f"2011-09-26 13:02:25.{100_000_000 * (k + 1):09d}\n" for k in range(5)]
+    (drive / "velodyne_points" / "timestamps.txt").write_text("".join(lines))
+    (drive / "oxts" / "data").mkdir(parents=True)
+    (drive / "oxts" / "timestamps.txt").write_text("".join(lines))
+    degree = np.degrees(1 / 6_378_137.0)
+    for k in range(5):
+        north = 49.0 + k * degree * np.sqrt(0.5)
+        east = 8.0 + k * degree * np.sqrt(0.5) / np.cos(np.radians(49.0))
+        text = f"{north:.12f} {east:.12f} 112.0 0.0 0.0 {np.pi / 4:.12f} 1 2 3\n"
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(text)
+    source = odomap.open(drive)
+    assert source.truth is None
+    assert any("calib_imu_to_velo.txt: missing" in note for note in source.notes)
+    calibration = "calib_time: 25-May-2012\nR: 1 0 0 0 1 0 0 0 1\nT: -1 0 -0.5\n"
+    (drive.parent / "calib_imu_to_velo.txt").write_text(calibration)
+    truth = odomap.open(drive).truth
+    assert truth is not None
+    ahead = np.sqrt(0.5) * (1 + np.arange(5.0))
+    expected = np.stack([ahead, ahead, np.full(5, 0.5)], axis=1)
+    np.testing.assert_allclose(truth.positions, expected, atol=1e-5)
+    forward = truth.Ts_world_body[2, :3, :3] @ [1, 0, 0]
+    np.testing.assert_allclose(forward, [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)
+    (drive / "oxts" / "data" / "0000000003.txt").write_text("49.0 eight\n")
+    source = odomap.open(drive)
+    assert source.truth is None
+    assert any("0000000003.txt:1: six numbers" in note for note in source.notes)
+
+
 @pytest.mark.parametrize("speed", [10.0, -4.0])
 def test_compensated_sweeps_get_no_times(tmp_path: Path, speed: float) -> None:
     root = write_velodyne(tmp_path)
@@ -89,6 +123,22 @@ def test_compensated_sweeps_get_no_times(tmp_path: Path, speed: float) -> None:
     assert off.frame(0).cloud.times is None
     with pytest.raises(InputError, match="times: 'of' is none of auto, azimuth, off"):
         odomap.open(f"{root}?times=of")
+
+
+def test_sweeps_of_other_sensors_get_times_from_their_rig(tmp_path: Path) -> None:
+    root = write_velodyne(tmp_path, beams=32)
+    source = odomap.open(root)
+    assert source.rig.lidars[0].beams == 32
+    assert source.frame(0).cloud.times is None
+    assert any("sweeps of 32 beams are not KITTI's" in note for note in source.notes)
+    (root / "rig.yaml").write_text(
+        "odomap_rig: 1\nlidars:\n  - {name: roof, sweep: counter_clockwise}\n"
+    )
+    source = odomap.open(root)
+    sweep = source.frame(0).cloud
+    azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    np.testing.assert_allclose(sweep.times, 0.1 * azimuth / (2 * np.pi), atol=1e-9)
+    assert source.rig.lidars[0].sweep == "counter_clockwise"
 
 
 def test_odometry_benchmark(tmp_path: Path) -> None:

@@ -23,8 +23,9 @@ class Info:
     """Say what a recording (frames, sensors, calibration, gaps, truth) or a map file holds."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images, a laser's log, a bag), a
-    camera ('camera:0'), a world.yaml, 'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
+    """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images or of a LiDAR's clouds, a
+    laser's log, a bag, a capture), a camera ('camera:0'), a world.yaml,
+    'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
     check: bool = False

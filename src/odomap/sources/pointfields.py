@@ -89,10 +89,13 @@ class PointFields:
 
 def points_of_table(table: PointTable) -> Array:
     """Return (N, 3) points of a table; places that cannot be are NaN."""
+    points = np.empty((table.count, 3))
+    lost = np.zeros(table.count, np.bool_)
     with np.errstate(invalid="ignore", over="ignore"):  # bytes that were damaged are any number
-        columns = [table.columns[_xyz(table, axis)].astype(np.float64) for axis in "xyz"]
-        points = np.stack(columns, axis=1)
-        points[~(np.abs(points) < FARTHEST_M).all(axis=1)] = np.nan
+        for k, axis in enumerate("xyz"):
+            points[:, k] = column = table.columns[_xyz(table, axis)].astype(np.float64)
+            lost |= ~(np.abs(column) < FARTHEST_M)
+    points[lost] = np.nan
     return points
 
 
@@ -101,8 +104,8 @@ def _xyz(table: PointTable, axis: str) -> str:
 
 
 def _seen(points: Array) -> NDArray[np.bool_]:
-    square = np.einsum("ni,ni->n", points, points)
-    return np.asarray((square > 0) & np.isfinite(square))
+    x, y, z = points.T
+    return np.asarray((x * x + y * y + z * z) > 0)  # not so of NaN
 
 
 def recognised(

@@ -71,9 +71,11 @@ class PointTimes:
         times = np.zeros(len(raw))
         if not seen.any():
             return times
-        values = raw[seen]
         begin = {"stamp": 0, "epoch": stamp_ns}.get(self.since)
-        times[seen] = _since(values, self.unit, begin)
+        if seen.all():
+            times = _since(raw, self.unit, begin)
+        else:
+            times[seen] = _since(raw[seen], self.unit, begin)
         if not (np.abs(times) <= self.reach_s).all():
             return None
         return times

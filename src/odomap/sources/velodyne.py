@@ -14,15 +14,14 @@ their files are the same. One sees it behind, where a sweep begins and ends: the
 there in raw sweeps, and steps by the distance driven meanwhile in compensated ones. Those get no
 times.
 
-Truth is poses_velodyne.txt (of the LiDAR), groundtruth.txt (TUM, of the LiDAR), or poses.txt (of
-the camera, brought over by Tr of calib.txt).
+Truth is poses_velodyne.txt (of the LiDAR), groundtruth.txt (TUM, of the LiDAR), poses.txt (of the
+camera, brought over by Tr of calib.txt), or what a raw drive's GPS says (`oxts`).
 
 Reference: A. Geiger et al., "Vision meets robotics: the KITTI dataset", Int. J. Robotics Research
 32(11), 2013.
 """
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +39,7 @@ from odomap.sensors.sweep import Sweep
 from odomap.sources.filenames import Clock, in_order, stamp_names
 from odomap.sources.listing import list_rows
 from odomap.sources.options import check_options
+from odomap.sources.oxts import epoch_text, read_oxts
 from odomap.sources.recording import check_truth
 from odomap.sources.source import Skipped, UnusableFrame
 from odomap.sources.survey import FAR_M, mounted_sweeps, sample, survey
@@ -60,6 +60,8 @@ SEAM = np.radians(1.5)
 """Two rows of a ring so near to each other, behind, see the same ground."""
 STEP_M, FEWEST_RINGS, SHARE = 0.1, 10, 0.2
 """A step behind of so much, in so many rings of so many of the sweeps, is no accident."""
+BEAMS = (60, 66)
+"""So many beams may be seen of an HDL-64E."""
 TIMES = ("auto", "azimuth", "off")
 
 
@@ -113,22 +115,25 @@ class VelodyneSource(SweepLog):
         rows, stamps = _stamp(folder, root, names, left_out, notes)
         self._files = [folder / names[row] for row in rows]
         self._stamps = stamps
-        self._rings, self._period = None, 0.0
+        self._rings, self._period, self._is_clockwise = None, 0.0, True
         sweeps = sample(len(stamps), self._sweep)
         points = [sweep.points for sweep in sweeps if len(sweep)]
         self._rings = rings_of(points)
-        is_raw, reason = _judged(how, points)
+        beams = 0 if self._rings is None else len(self._rings)
+        said = "none" if rig is None or len(rig.lidars) != 1 else rig.lidars[0].sweep
+        is_raw, reason = _judged(how, points, beams, said)
+        self._is_clockwise = said != "counter_clockwise"
         notes.append(reason)
         rate = usual_rate(stamps, RATE_HZ)
         self._period = 1 / rate if is_raw else 0.0
-        how_times = "from the azimuth: clockwise from behind, stamped ahead" if is_raw else ""
+        turns = ("clockwise" if self._is_clockwise else "counter_clockwise") if is_raw else "none"
+        how_times = f"from the azimuth: {turns} from behind, stamped ahead" if is_raw else ""
         facts = survey(
             [self._column(sweep) for sweep in sweeps],
             how_times,
-            0 if self._rings is None else len(self._rings),
-            "" if self._rings is None else "from the order of the rows",
+            beams,
+            "from the order of the rows" if beams else "",
         )
-        turns = "clockwise" if is_raw else "none"
         mount = LidarMount("velodyne", range_m=(HOUSING_M, FAR_M), rate_hz=rate, sweep=turns)
         super().__init__(
             name=(root if folder.name in ("velodyne", "data") else folder).resolve().name,
@@ -162,7 +167,9 @@ class VelodyneSource(SweepLog):
         azimuth = azimuths(sweep.points)
         return Sweep(
             sweep.points,
-            turn_times(azimuth, self._period, True, BEHIND, 0.0) if self._period else None,
+            turn_times(azimuth, self._period, self._is_clockwise, BEHIND, 0.0)
+            if self._period
+            else None,
             sweep.intensities,
             None if self._rings is None else self._rings.beams(sweep.points, azimuth),
         )
@@ -178,10 +185,17 @@ def _root(folder: Path) -> Path:
     return folder
 
 
-def _judged(how: str, sweeps: list[Array]) -> tuple[bool, str]:
-    """Return whether sweeps are raw, and why."""
+def _judged(how: str, sweeps: list[Array], beams: int, said: str) -> tuple[bool, str]:
+    """Return whether times follow from azimuths, and why."""
     if how != "auto":
         return how == "azimuth", f"?times={how} is believed"
+    if said != "none":
+        return True, f"sweeps turn {said}, as the rig says: times follow from the azimuth"
+    if sweeps and not BEAMS[0] <= beams <= BEAMS[1]:
+        return False, (
+            f"sweeps of {beams or 'unknown'} beams are not KITTI's: points carry no times; "
+            "?times=azimuth, or 'sweep' in a rig.yaml, if they turn as KITTI's do"
+        )
     steps = [step for step in map(_step_behind, sweeps) if step is not None]
     moved = [step for step in steps if abs(step) > STEP_M]
     if len(moved) > max(1, SHARE * len(steps)):
@@ -221,7 +235,7 @@ def _stamp(
     """Return which of the files to use, in order of time, and their stamps."""
     raw = root / "timestamps.txt"
     if raw.is_file() and not (root / "times.txt").is_file():
-        texts = [(line, _epoch(raw, line, cells)) for line, cells in read_lines(raw)]
+        texts = [(line, epoch_text(raw, line, cells)) for line, cells in read_lines(raw)]
         numbers = [int(Path(n).stem) if Path(n).stem.isdigit() else i for i, n in enumerate(names)]
         rows = [
             (*texts[number], str(place))
@@ -241,18 +255,6 @@ def _stamp(
     return stamp_names(names, Clock(file, RATE_HZ, folder, "sweeps"), left_out, notes)
 
 
-def _epoch(file: Path, line: int, cells: list[str]) -> str:
-    """Return the seconds of a date and a time of day, as text with all its digits."""
-    day, _, fraction = " ".join(cells).partition(".")
-    try:
-        moment = datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-    except ValueError:
-        if len(cells) == 1:  # seconds
-            return cells[0]
-        raise InputError(f"{file}:{line}: '{' '.join(cells)}' is no date and time") from None
-    return f"{int(moment.timestamp())}.{fraction or '0'}"
-
-
 def _read_truth(root: Path, stamps: NDArray[np.int64], notes: list[str]) -> Trajectory | None:
     times = root / "times.txt"
     own, camera = root / "poses_velodyne.txt", root / "poses.txt"
@@ -266,7 +268,8 @@ def _read_truth(root: Path, stamps: NDArray[np.int64], notes: list[str]) -> Traj
             return check_truth(truth, stamps, "groundtruth.txt", notes)
         file = camera if camera.is_file() else beside
         if not file.is_file():
-            return None
+            drive = read_oxts(root.parent)
+            return None if drive is None else check_truth(drive, stamps, "oxts", notes)
         T = _camera_velodyne(root / "calib.txt")
         if T is None:
             notes.append(f"{file.name}: of a camera, and calib.txt has no Tr: truth ignored")
