@@ -24,7 +24,7 @@ def true_map(data, every, T_new_world=None):
     move = np.eye(4) if T_new_world is None else T_new_world
     for index in range(0, len(source), every):
         frame = source.frame(index)
-        cloud = None if frame.cloud is None else frame.cloud.points
+        cloud = None if frame.cloud is None else frame.cloud.points.astype(np.float32)
         keyframe = Keyframe(m.new_keyframe_id(), frame.stamp_ns, scan=frame.scan, cloud=cloud)
         m.add_keyframe(keyframe, move @ source.truth.Ts_world_body[index])
     return m

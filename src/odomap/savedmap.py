@@ -29,6 +29,7 @@ KINDS = {
     "rgbd": "a camera with depth",
     "mono": "one camera",
     "lidar2d": "a 2D laser",
+    "lidar3d": "a 3D LiDAR",
 }
 """What `tracking.sensors` says, in words."""
 

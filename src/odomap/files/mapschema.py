@@ -121,7 +121,7 @@ PAYLOADS: Mapping[str, tuple[Column, ...]] = MappingProxyType(
             Column("level", "|u1"),
         ),
         "scan": (Column("ranges", "<f8"),),
-        "cloud": (Column("points", "<f8", None),),
+        "cloud": (Column("points", "<f4", None),),
         "imu": (
             Column("stamps_ns", "<i8"),
             Column("gyro", "<f8", (3,)),

@@ -30,6 +30,7 @@ from odomap.lidar.voxels import Cells, axis_of_key, into_cells, key_of, slot_of
 
 __all__ = [
     "cell_covariances",
+    "longest_cross",
     "nearest_covariances",
     "normals_of",
     "warm_up",
@@ -123,7 +124,28 @@ def _nearest_kernel(points: Array, queries: Index, rows: Index, out: Array) -> N
 
 
 @kernel
-def _longest_cross(
+def eigenvalues(
+    a: float, b: float, c: float, d: float, e: float, f: float
+) -> tuple[float, float, float]:
+    """λ₀ ≤ λ₁ ≤ λ₂ of C = [[a, b, c], [b, d, e], [c, e, f]].
+
+    λ = m + 2 p cos(φ + 2πk/3),  m = tr C / 3,  p² = |C - m I|² / 6,  φ = ⅓ acos(det(C - m I) / 2p³)
+    """
+    m = (a + d + f) / 3.0
+    u, v, w = a - m, d - m, f - m
+    p2 = (u * u + v * v + w * w + 2.0 * (b * b + c * c + e * e)) / 6.0
+    p = np.sqrt(p2)
+    det = u * (v * w - e * e) - b * (b * w - e * c) + c * (b * e - v * c)
+    turn = 0.0
+    if p2 * p > 0.0:
+        turn = np.arccos(min(max(det / (2.0 * p2 * p), -1.0), 1.0)) / 3.0
+    largest = m + 2.0 * p * np.cos(turn)
+    least = m + 2.0 * p * np.cos(turn + 2.0 * np.pi / 3.0)
+    return least, 3.0 * m - largest - least, largest
+
+
+@kernel
+def longest_cross(
     a: float, b: float, c: float, d: float, e: float, f: float
 ) -> tuple[float, float, float, float]:
     """The longest cross product of two rows of [[a, b, c], [b, d, e], [c, e, f]]; its square."""
@@ -142,27 +164,14 @@ def _longest_cross(
 
 @kernel
 def _normal_kernel(spread: Array, planar: bool, normals: Array, tilts: Array) -> None:
-    """Normals v₀ of spreads n, C, unless the points lie on a line; tilts: n (0: none), λ, share.
-
-    λ = m + 2 p cos(φ + 2πk/3),  m = tr C / 3,  p² = |C - m I|² / 6,  φ = ⅓ acos(det(C - m I) / 2p³)
-    """
+    """Normals v₀ of spreads n, C, unless the points lie on a line; tilts: n (0: none), λ, share."""
     for r in range(spread.shape[0]):
         a, b, c = spread[r, 1], spread[r, 2], spread[r, 3]
         d, e, f = spread[r, 4], spread[r, 5], spread[r, 6]
         if planar:
             c, e, f = 0.0, 0.0, 4.0 * (a + d)
-        m = (a + d + f) / 3.0
-        u, v, w = a - m, d - m, f - m
-        p2 = (u * u + v * v + w * w + 2.0 * (b * b + c * c + e * e)) / 6.0
-        p = np.sqrt(p2)
-        det = u * (v * w - e * e) - b * (b * w - e * c) + c * (b * e - v * c)
-        turn = 0.0
-        if p2 * p > 0.0:
-            turn = np.arccos(min(max(det / (2.0 * p2 * p), -1.0), 1.0)) / 3.0
-        largest = m + 2.0 * p * np.cos(turn)
-        least = m + 2.0 * p * np.cos(turn + 2.0 * np.pi / 3.0)
-        middle = 3.0 * m - largest - least
-        x, y, z, n2 = _longest_cross(a - least, b, c, d - least, e, f - least)
+        least, middle, largest = eigenvalues(a, b, c, d, e, f)
+        x, y, z, n2 = longest_cross(a - least, b, c, d - least, e, f - least)
         known = spread[r, 0] >= 3.0 and n2 > 0.0 and middle - least > LINE * largest
         size = 1.0 / np.sqrt(n2) if known else 0.0
         normals[r, 0], normals[r, 1], normals[r, 2] = x * size, y * size, z * size

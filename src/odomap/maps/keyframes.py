@@ -40,7 +40,7 @@ class Keyframe:
     stamp_ns: int
     features: "Features | None" = None
     scan: NDArray[np.float64] | None = None
-    cloud: NDArray[np.float64] | None = None
+    cloud: NDArray[np.float32] | None = None
     submap: object | None = None
     imu: ImuSamples | None = None
 

@@ -1,14 +1,66 @@
 """Settings of SLAM with a 3D LiDAR, in one place and without what they set.
 
 Reading them compiles nothing, so that the command line can show them at once. What they are for is
-told where they are used: `cloudclosing`, `cloudrecognition`, `cloudthinning`.
+told where they are used: `cloudtracking`, `cloudclosing`, `cloudrecognition`, `cloudthinning`.
 """
 
 from dataclasses import dataclass
 
+from odomap.errors import ConfigError, nearest_name
 from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
 
-__all__ = ["CloudClosingConfig", "CloudRecognitionConfig", "CloudThinningConfig"]
+__all__ = [
+    "CloudClosingConfig",
+    "CloudRecognitionConfig",
+    "CloudThinningConfig",
+    "CloudTrackingConfig",
+]
+
+FRONT_ENDS = ("points", "loam", "lego")
+
+
+@dataclass(frozen=True)
+class CloudTrackingConfig:
+    """How sweeps are placed and when one becomes a keyframe."""
+
+    front_end: str = "points"
+    """What sweeps are matched by: "points" (surfaces), "loam" (edges and planes) or "lego" (ground
+    first, then edges)."""
+    farthest: Positive = 100.0
+    """Points beyond are not used, metres."""
+    min_points: Count = 100
+    """Points that must return for a sweep to say anything."""
+    min_share: Fraction = 0.25
+    """Share of the points that must lie on what is known."""
+    rounds: Count = 2
+    """How often a sweep is laid down, each time deskewed by the motion found before."""
+    fastest: Positive = 60.0
+    """Speed above which a body does not move, m/s."""
+    acceleration: Positive = 5.0
+    """Standard deviation of what changes a velocity, m/s²."""
+    angular: Positive = 3.0
+    """The same of a rotation, rad/s²."""
+    unseen: Positive = 2.0
+    """Standard deviation of a velocity that nobody saw for a while, m/s."""
+    unseen_rad: Positive = 0.5
+    """The same of a rotation, rad/s."""
+    renewal: NotNegative = 1.0
+    """Share of a step's error that goes into the map, and stays."""
+    patience: Count = 10
+    """Sweeps in a row that are placed nowhere, after which a piece of the map is begun."""
+    keyframe_m: Positive = 2.0
+    """Distance from the last keyframe at which a sweep becomes one, metres."""
+    keyframe_rad: Positive = 0.5
+    """The same of the rotation, radians."""
+    keyframe_voxel: Positive = 0.3
+    """Side of the cells of which a keyframe keeps one point each, metres."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+        if self.front_end not in FRONT_ENDS:
+            known = ", ".join(FRONT_ENDS)
+            near = nearest_name(self.front_end, FRONT_ENDS)
+            raise ConfigError(f"front_end: '{self.front_end}' is none of {known}{near}")
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ file only gathers them and names the presets.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.backend.bundle import BundleConfig
 from odomap.errors import CalibrationError, ConfigError, nearest_name
+from odomap.lidar.cloudconfig import PointsConfig
 from odomap.lidar.scanconfig import ScanConfig
 from odomap.sensors.rig import Rig
 from odomap.system.adjusting import AdjustingConfig
@@ -24,6 +26,7 @@ from odomap.system.association import (
 )
 from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
+from odomap.system.cloudconfig import CloudTrackingConfig
 from odomap.system.creating import CreateConfig
 from odomap.system.culling import CullConfig
 from odomap.system.fusing import FuseConfig
@@ -57,8 +60,10 @@ __all__ = [
 ]
 
 
-LASER = "lidar2d"
-"""What `tracking.sensors` says of a 2D laser; sections of cameras are of no use to it then."""
+LASER: Final = "lidar2d"
+LIDAR: Final = "lidar3d"
+"""What `tracking.sensors` says of a 2D laser and of a 3D LiDAR, to which sections of cameras are of
+no use."""
 NO_LOOPS = ClosingConfig(enabled=False)
 """Where landmarks are followed by optical flow: it is for speed, and describes one level only."""
 
@@ -117,6 +122,10 @@ class Config:
     """When scans are searched for in earlier submaps, and the path is corrected."""
     scan_thinning: ScanThinningConfig = field(default_factory=ScanThinningConfig)
     """When submaps go that show nothing new."""
+    points: PointsConfig = field(default_factory=PointsConfig)
+    """How sweeps are laid onto surfaces."""
+    cloud_tracking: CloudTrackingConfig = field(default_factory=CloudTrackingConfig)
+    """How sweeps are placed and when one becomes a keyframe."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 
@@ -181,6 +190,14 @@ def _lidar2d() -> Config:
     )
 
 
+def _lidar() -> Config:
+    return Config(
+        tracking=TrackingConfig(sensors=LIDAR),
+        closing=NO_LOOPS,
+        threads=ThreadConfig(closing_line=4),
+    )
+
+
 PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
     {
         "stereo": _stereo,
@@ -190,9 +207,10 @@ PRESETS: Mapping[str, Callable[[], Config]] = MappingProxyType(
         "mono-flow": _mono_flow,
         "rgbd-flow": _rgbd_flow,
         "lidar2d": _lidar2d,
+        "lidar": _lidar,
     }
 )
-"""Named configurations: stereo, mono, rgbd, the same with optical flow, for speed, and lidar2d."""
+"""Named configurations: of cameras, the same with optical flow, for speed, and of LiDARs."""
 
 
 def preset(name: str) -> Config:
@@ -213,15 +231,16 @@ def preset(name: str) -> Config:
 
 
 def preset_for(rig: Rig) -> str:
-    """Return the preset for what a rig carries: rgbd, stereo or mono, or lidar2d without a camera.
+    """Return the preset for what a rig carries: rgbd, stereo or mono; without a camera lidar2d, or
+    lidar.
 
     Raises:
-        CalibrationError: it has neither a camera nor a 2D laser.
+        CalibrationError: it has neither a camera nor a LiDAR.
     """
     if not rig.cameras and any(mount.angles[2] for mount in rig.lidars):
         return LASER
     if not rig.cameras and rig.lidars:
-        raise CalibrationError("this rig has a LiDAR and no camera: there is no preset for it yet")
+        return "lidar"
     if not rig.cameras:
         raise CalibrationError("this rig has no camera: odometry needs one")
     if rig.depth is not None:

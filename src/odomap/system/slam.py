@@ -7,14 +7,15 @@
     odomap.save_map("home.odomap", result.map, source.rig)
 
 What the configuration says of the sensors decides which system it is: that of cameras
-(`visualslam`) or that of a 2D laser (`laserslam`). What they share is in `system`.
+(`visualslam`), of a 2D laser (`laserslam`) or of a 3D LiDAR (`cloudslam`). What they share is in
+`system`.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from odomap.maps.map import Map
 from odomap.sensors.rig import Rig
-from odomap.system.config import LASER, Config, preset, preset_for
+from odomap.system.config import LASER, LIDAR, Config, preset, preset_for
 from odomap.system.system import System
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class Slam(System):
     """Simultaneous localisation and mapping with the sensors of a rig.
 
     Args:
-        rig: one camera, a stereo pair, a camera with depth, or a 2D laser.
+        rig: one camera, a stereo pair, a camera with depth, a 2D laser, or a 3D LiDAR.
         config: sections for all parts; default the preset for what the rig carries.
         rhythm: which thread runs what; see `rhythms`.
         map: a map to go on with; default a new one.
@@ -48,7 +49,7 @@ class Slam(System):
         InputError: the vocabulary that the configuration names cannot be used.
     """
 
-    if TYPE_CHECKING:  # what it makes is one of the two kinds
+    if TYPE_CHECKING:  # what it makes is one of its kinds
 
         def __init__(
             self,
@@ -72,6 +73,10 @@ class Slam(System):
             from odomap.system.laserslam import LaserSlam
 
             return LaserSlam(rig, chosen, *args, **kwargs)
+        if chosen.tracking.sensors == LIDAR:
+            from odomap.system.cloudslam import CloudSlam
+
+            return CloudSlam(rig, chosen, *args, **kwargs)
         from odomap.system.visualslam import VisualSlam
 
         return VisualSlam(rig, chosen, *args, **kwargs)

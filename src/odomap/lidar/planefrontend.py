@@ -1,0 +1,142 @@
+"""The front-end "points": sweeps laid onto surfaces, with nothing told apart beforehand.
+
+    sweep → the first point of each small voxel, to be added → of each large one, to be matched
+    match: deskewed by the motion so far, Gauss–Newton onto surfaces (`planematching`)
+
+How far the guess may be off is learned from how far it was: its deviations from what was found,
+as far as they move points at the largest range, are averaged, and three times that is how wide the
+search begins.
+
+Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8(2), 2023 (thinning
+and threshold); K. Koide et al., "Voxelized GICP for fast and accurate 3D point cloud registration",
+ICRA 2021.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.lie import se3_inverse, se3_log
+from odomap.kernels import kernel
+from odomap.lidar.cloudconfig import PointsConfig
+from odomap.lidar.deskew import deskew
+from odomap.lidar.frontend import SweepMatch
+from odomap.lidar.planemap import PlaneMap
+from odomap.lidar.planematching import match_planes
+from odomap.lidar.sweeps import SweepPoints
+from odomap.lidar.voxels import FURTHEST, key_of
+
+__all__ = ["PlaneFrontEnd", "ThinSweep", "first_in_voxels"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ThinSweep:
+    """A sweep thinned out: points (N, 3) to be added, times (N,), and rows to be matched."""
+
+    points: Array
+    times: Array
+    matched: Index
+
+
+class PlaneFrontEnd:
+    """Lays sweeps onto surfaces.
+
+    Args:
+        config: sizes; a voxel of 0 is chosen at the first sweep, by how far it sees.
+    """
+
+    def __init__(self, config: PointsConfig | None = None) -> None:
+        self._config = PointsConfig() if config is None else config
+        self._voxel = self._config.voxel
+        self._map: PlaneMap | None = None
+        self._off2, self._far = self._config.first_off**2, 0.0
+
+    def prepare(self, sweep: SweepPoints) -> ThinSweep:
+        """Thin a sweep out."""
+        config = self._config
+        if not self._voxel and len(sweep):
+            self._voxel = suitable_voxel(sweep.points, config)
+        voxel = self._voxel or 1.0
+        rows = first_in_voxels(sweep.points, config.added * voxel)
+        points, times = sweep.points[rows], sweep.times[rows]
+        return ThinSweep(points, times, first_in_voxels(points, config.matched * voxel))
+
+    def match(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> SweepMatch:
+        """Find where a sweep was taken."""
+        rows = prepared.matched
+        points = deskew(prepared.points[rows], prepared.times[rows], twist)
+        if self._map is None or len(points) == 0:
+            return SweepMatch(T_map_body, np.zeros((6, 6)), 0, len(points), 0.0, False, "no map")
+        surfaces, config = self._map, self._config
+        wide = 9.0 * (1.0 + self._off2 / surfaces.sigma**2)
+        T, H, on, mean, is_still = match_planes(surfaces, points, T_map_body, wide)
+        self._note(T_map_body, T, points)
+        information = H / (config.alike * max(mean, config.least_spread))
+        error = surfaces.sigma * float(np.sqrt(mean))
+        reason = "" if is_still else "it did not come to rest"
+        return SweepMatch(T, information, on, len(points), error, is_still, reason)
+
+    def _note(self, T_guess: Array, T: Array, points: Array) -> None:
+        """Learn from how far the guess was off."""
+        xi = se3_log(se3_inverse(T_guess) @ T)
+        far = float(np.sqrt(np.mean(np.einsum("ni,ni->n", points, points))))
+        off = float(np.linalg.norm(xi[:3])) + far * float(np.linalg.norm(xi[3:]))
+        self._off2 += self._config.learning * (off * off - self._off2)
+
+    def insert(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> None:
+        """Add a sweep, and forget what is far."""
+        if self._map is None:
+            self._map = PlaneMap(self._voxel or 1.0, self._config.sigma * (self._voxel or 1.0))
+        points = deskew(prepared.points, prepared.times, twist)
+        self._map.insert(points @ T_map_body[:3, :3].T + T_map_body[:3, 3])
+        self._map.evict(T_map_body[:3, 3], self._config.farthest * self._map.voxel)
+
+    def clear(self) -> None:
+        """Forget the map."""
+        self._map, self._off2 = None, self._config.first_off**2
+
+
+def suitable_voxel(points: Array, config: PointsConfig) -> float:
+    """Return a voxel for a place: a share of how far half of what is seen is away."""
+    away = float(np.median(np.linalg.norm(points, axis=1)))
+    return float(np.clip(config.voxel_share * away, config.least_voxel, config.most_voxel))
+
+
+def first_in_voxels(points: Array, size: float) -> Index:
+    """Return the rows of the first point in each voxel, in order."""
+    slots = 1 << max(int(2 * len(points)).bit_length(), 4)
+    rows = np.empty(len(points), np.int64)
+    count = _first_kernel(points, size, np.full(slots, -1, np.int64), rows)
+    return rows[:count]
+
+
+@kernel
+def _first_kernel(points: Array, size: float, seen: Index, rows: Index) -> int:
+    """rows ← the first point of each voxel; those that are too far to be numbered are left out."""
+    inverse, mask, count = 1.0 / size, seen.shape[0] - 1, 0
+    last = -1
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0] * inverse, points[n, 1] * inverse, points[n, 2] * inverse
+        if not max(abs(x), abs(y), abs(z)) < FURTHEST - 1:
+            continue
+        key = key_of(int(np.floor(x)), int(np.floor(y)), int(np.floor(z)))
+        if key == last:
+            continue
+        last = key
+        at = ((int(key) * 0x1E3779B97F4A7C15) >> 36) & mask
+        while seen[at] != key and seen[at] >= 0:
+            at = (at + 1) & mask
+        if seen[at] < 0:
+            seen[at] = key
+            rows[count] = n
+            count += 1
+    return count
+
+
+def warm_up() -> None:
+    """Compile the kernels of this file."""
+    first_in_voxels(np.ones((2, 3)), 1.0)

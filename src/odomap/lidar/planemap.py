@@ -1,0 +1,219 @@
+"""A map of surfaces: voxels that know how the points that fell into them are spread.
+
+A sweep is laid onto what sweeps before it saw. Of the points that fell into a voxel are kept n, Σ u
+and Σ u uᵀ, and with that their mean μ and covariance
+
+    C = Σ_i λ_i v_i v_iᵀ,     λ₀ ≤ λ₁ ≤ λ₂.
+
+Where they lie in a plane, a point p is off it by r = nᵀ (μ - p), n being the normal v₀ with a
+length that says how thin the plane is: |n|² = f / (λ₀ + σ²), f = 1 - λ₀ / (κ λ₁). So a wall is one
+term, whatever way its points lie, and a sweep is matched to surfaces and not to points of other
+beams. Where they lie on a line, as those of one beam do, there is no plane.
+
+Beams that are far apart draw lines in small voxels, which are planes in large ones. So there are
+two levels, the second of voxels COARSER times as large, far away in the same table.
+
+Voxels farther than a distance from the body are forgotten. Cost: 80 ns for a point that is
+inserted, 0.3 µs for the plane of a voxel, which is found when it is first asked for.
+
+Reference: K. Koide, M. Yokozuka, S. Oishi, A. Banno, "Voxelized GICP for fast and accurate 3D point
+cloud registration", ICRA 2021; P. Biber, W. Straßer, "The normal distributions transform", IROS
+2003.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.kernels import kernel
+from odomap.lidar.normals import eigenvalues, longest_cross
+from odomap.lidar.voxels import (
+    FURTHEST,
+    axis_of_key,
+    key_of,
+    new_table,
+    rehash_kernel,
+    slot_of,
+)
+
+__all__ = ["COARSER", "FAR_AWAY", "NONE", "OLD", "SURFACE", "PlaneMap", "plane_kernel"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Flags = NDArray[np.int8]
+
+OLD, NONE, SURFACE = np.int8(0), np.int8(1), np.int8(2)
+"""What is known of a voxel: its plane is to be found again, there is none, or it is there."""
+COARSER = 3
+"""Size of large voxels in small ones."""
+FAR_AWAY = FURTHEST // 2
+"""Where along x large voxels are in the table, in voxels; small ones stay nearer."""
+FEWEST = 6
+"""Points from which on they may lie in a plane."""
+MANY = 400.0
+"""Points whose sums are halved, so that a voxel follows what changes."""
+THIN = 0.3
+"""κ: λ₀ / λ₁ from which on points do not lie in a plane."""
+LINE = 0.03
+"""Of λ₂: what λ₁ must exceed λ₀ by, else points lie on a line."""
+FIRST_ROOM = 4096
+
+
+@kernel
+def plane_kernel(
+    v: int, key: int, size: float, sums: Array, sigma2: float, means: Array, normals: Array
+) -> bool:
+    """μ (V, 3) and n (V, 3) of a voxel; whether its points lie in a plane."""
+    n = sums[v, 0]
+    if n < FEWEST:
+        return False
+    i = axis_of_key(key, 0)
+    if i > FAR_AWAY // 2:
+        i, size = i - FAR_AWAY, size * COARSER
+    x, y, z = sums[v, 1] / n, sums[v, 2] / n, sums[v, 3] / n
+    means[v, 0], means[v, 1] = x + (i + 0.5) * size, y + (axis_of_key(key, 1) + 0.5) * size
+    means[v, 2] = z + (axis_of_key(key, 2) + 0.5) * size
+    unbiased = n / (n - 1.0)
+    a, b = unbiased * (sums[v, 4] / n - x * x), unbiased * (sums[v, 5] / n - x * y)
+    c, d = unbiased * (sums[v, 6] / n - x * z), unbiased * (sums[v, 7] / n - y * y)
+    e, f = unbiased * (sums[v, 8] / n - y * z), unbiased * (sums[v, 9] / n - z * z)
+    least, middle, largest = eigenvalues(a, b, c, d, e, f)
+    if middle - least <= LINE * largest or least >= THIN * middle:
+        return False
+    x, y, z, square = longest_cross(a - least, b, c, d - least, e, f - least)
+    if not square > 0.0:
+        return False
+    share = 1.0 - least / (THIN * middle)
+    length = np.sqrt(share / ((least + sigma2) * square))
+    normals[v, 0], normals[v, 1], normals[v, 2] = length * x, length * y, length * z
+    return True
+
+
+@kernel
+def _insert_kernel(
+    points: Array, first: int, size: float, table: Index, keys: Index, sums: Array, flags: Flags,
+    count: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Add points from `first` on to the sums of a small voxel and a large one each.
+
+    Returns where it stopped, for want of room if before the end, and how many voxels there are.
+    """
+    for n in range(first, points.shape[0]):
+        if count + 2 > keys.shape[0]:
+            return n, count
+        for level in range(2):
+            side = size * COARSER if level else size
+            x, y, z = points[n, 0] / side, points[n, 1] / side, points[n, 2] / side
+            i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+            key = key_of(i + FAR_AWAY if level else i, j, k)
+            slot = slot_of(key, table)
+            v = int(table[slot, 1])
+            if v < 0:
+                v = count
+                table[slot, 0], table[slot, 1], keys[v] = key, v, key
+                for c in range(10):
+                    sums[v, c] = 0.0
+                count += 1
+            elif sums[v, 0] >= MANY:
+                for c in range(10):
+                    sums[v, c] *= 0.5
+            x, y, z = side * (x - i - 0.5), side * (y - j - 0.5), side * (z - k - 0.5)
+            sums[v, 0] += 1.0
+            sums[v, 1] += x
+            sums[v, 2] += y
+            sums[v, 3] += z
+            sums[v, 4] += x * x
+            sums[v, 5] += x * y
+            sums[v, 6] += x * z
+            sums[v, 7] += y * y
+            sums[v, 8] += y * z
+            sums[v, 9] += z * z
+            flags[v] = OLD
+    return points.shape[0], count
+
+
+@kernel
+def _near_kernel(keys: Index, size: float, centre: Array, distance: float, near: Index) -> int:
+    """near ← voxels whose middle is within a distance; returns how many."""
+    count = 0
+    for v in range(keys.shape[0]):
+        i, side = axis_of_key(keys[v], 0), size
+        if i > FAR_AWAY // 2:
+            i, side = i - FAR_AWAY, size * COARSER
+        x = (i + 0.5) * side - centre[0]
+        y = (axis_of_key(keys[v], 1) + 0.5) * side - centre[1]
+        z = (axis_of_key(keys[v], 2) + 0.5) * side - centre[2]
+        if x * x + y * y + z * z <= distance * distance:
+            near[count] = v
+            count += 1
+    return count
+
+
+class PlaneMap:
+    """Surfaces around a body.
+
+    Args:
+        voxel: side of a small voxel, metres.
+        sigma: least thickness of a surface, metres.
+
+    Attributes:
+        table, keys, sums, flags, means, normals: arrays of the voxels, for kernels; the first
+            `len` rows count.
+    """
+
+    def __init__(self, voxel: float, sigma: float) -> None:
+        self.voxel, self.sigma = voxel, sigma
+        self.clear()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._size = 0
+        self._make(FIRST_ROOM)
+
+    def _make(self, room: int) -> None:
+        self.table, self.keys = new_table(room), np.empty(room, np.int64)
+        self.sums, self.flags = np.empty((room, 10)), np.zeros(room, np.int8)
+        self.means, self.normals = np.empty((room, 3)), np.empty((room, 3))
+
+    def insert(self, points: Array) -> None:
+        """Add points (N, 3) in the map's frame; those too far from its origin are left out."""
+        inside = 0.25 * FURTHEST * self.voxel
+        if len(points) and not float(np.abs(points).max()) < inside:
+            points = points[np.abs(points).max(axis=1) < inside]
+        done = 0
+        while True:
+            done, self._size = _insert_kernel(
+                points, done, self.voxel, self.table, self.keys, self.sums, self.flags, self._size
+            )
+            if done == len(points):
+                return
+            self._keep(np.arange(self._size), 2 * self._size + 2)
+
+    def evict(self, centre: Array, distance: float) -> int:
+        """Forget voxels farther than a distance from a point (3,); return how many."""
+        near = np.empty(self._size, np.int64)
+        near = near[: _near_kernel(self.keys[: self._size], self.voxel, centre, distance, near)]
+        gone = self._size - len(near)
+        if gone:
+            self._keep(near, max(FIRST_ROOM, len(near) + len(near) // 2))
+        return gone
+
+    def _keep(self, rows: Index, room: int) -> None:
+        """Keep some voxels, in their order, with room for others."""
+        names = "keys", "sums", "flags", "means", "normals"
+        old = [getattr(self, name)[rows] for name in names]
+        self._make(room)
+        for name, kept in zip(names, old, strict=True):
+            getattr(self, name)[: len(rows)] = kept
+        self._size = len(rows)
+        rehash_kernel(self.keys, self._size, self.table)
+
+
+def warm_up() -> None:
+    """Compile the kernels of this file."""
+    surfaces = PlaneMap(1.0, 0.05)
+    surfaces.insert(np.array([[x, y, 0.01 * x * y] for x in range(3) for y in range(3)]) / 3.0)
+    plane_kernel(0, surfaces.keys[0], 1.0, surfaces.sums, 0.01, surfaces.means, surfaces.normals)
+    surfaces.evict(np.zeros(3), 0.1)

@@ -1,0 +1,308 @@
+"""Tracking with a 3D LiDAR: every sweep is laid onto what the sweeps before it saw.
+
+Where the body is by now is predicted: it goes on as before, ξ being its motion per second. From
+there the front-end finds it on its map (`lidar/frontend`), with the sweep deskewed by ξ; that gives
+a better ξ, and with it the sweep is deskewed and laid down once more:
+
+    x̂ = x exp(ξ Δt),     x = match(x̂, ξ),     ξ = log(x_before⁻¹ x) / Δt
+
+All that is from the middle of one sweep to the middle of the next, where a constant motion errs
+least; where the body was at the stamp lies between two such poses, x exp(-ξ τ), τ from stamp to
+middle.
+
+The map of the front-end is in a frame of odometry that nothing ever moves; a frame hangs from its
+keyframe by T_keyframe_body = T_odom_keyframe⁻¹ T_odom_body, so that loops move keyframes and never
+pull the tracker from under its feet. What a match says of the step is weighed against how a body
+can move at all,
+
+    P_step = (Q⁻¹ + Λ)⁻¹,        Q = diag(σ_a Δt², σ_ω Δt)²,
+
+so along a tunnel, of whose length walls say nothing, the covariance grows.
+
+A sweep that says nothing is lost; the body is taken to go on, and the next one that fits where it
+may be by then is where it goes on. Where nothing fits it is looked for in the whole map
+(`cloudrecognition`), and after a while a piece of its own is begun, to be joined when it is
+recognised.
+
+Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8(2), 2023.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.errors import CalibrationError
+from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
+from odomap.geometry.pose import SE3
+from odomap.lidar.frontend import FrontEnd, SweepMatch
+from odomap.maps.edges import ODOMETRY
+from odomap.maps.estimate import Estimate, Status
+from odomap.maps.keyframes import Keyframe
+from odomap.maps.map import Map
+from odomap.sensors.frame import Frame
+from odomap.system.cloudconfig import CloudTrackingConfig
+from odomap.system.cloudview import CloudView, CloudViewer
+from odomap.system.path import Path, Placed
+
+__all__ = ["CloudTracker"]
+
+Array = NDArray[np.float64]
+
+ANEW = "started anew where it was last: how it moved since is not known"
+LONGEST_S = 1.0
+"""Time over which a body is taken to go on as before."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Wanted:
+    """A sweep that is to be a keyframe."""
+
+    view: CloudView
+    twist: Array
+
+
+class CloudTracker:
+    """Places the sweeps of a 3D LiDAR.
+
+    Args:
+        map: where keyframes go.
+        viewer: makes sweeps ready.
+        front_end: lays them onto each other.
+        config: how.
+        is_mapping: whether sweeps become keyframes.
+
+    Attributes:
+        path: the frames placed so far.
+    """
+
+    def __init__(
+        self,
+        map: Map,
+        viewer: CloudViewer,
+        front_end: FrontEnd[Any],
+        config: CloudTrackingConfig,
+        is_mapping: bool = True,
+    ) -> None:
+        self._map, self._viewer, self._front_end, self._config = map, viewer, front_end, config
+        self._is_mapping = is_mapping
+        self.path = Path(map)
+        self._T_odom_middle, self._twist = np.eye(4), np.zeros(6)
+        self._middle_ns = 0
+        self._T_odom_body = np.eye(4)
+        self._keyframe, self._T_odom_keyframe = -1, np.eye(4)
+        self._drift = np.zeros((6, 6))
+        self._step = np.zeros((6, 6))
+        self._wanted: _Wanted | None = None
+        self._made: int | None = None
+        self._before: CloudView | None = None
+        self._lost = 0
+        self._first: CloudView | None = None
+
+    def prepare(self, frame: Frame) -> CloudView:
+        """Make a sweep ready, without looking at the map."""
+        return self._viewer.view(frame)
+
+    def track(self, view: CloudView) -> Estimate:
+        """Place a sweep.
+
+        Raises:
+            CalibrationError: the sweeps cannot be what the rig says.
+        """
+        view.clock.resume()
+        self._made, self._wanted = None, None
+        if view.wrong:
+            raise CalibrationError(view.wrong)
+        reason = view.says_nothing(self._config.min_points)
+        if not reason and view.is_like(self._before):
+            reason = "the sweep is the one before, bit by bit: frozen?"
+        self._before = view
+        if reason:
+            return self._pass_over(view, reason)
+        if self._keyframe < 0:
+            return self._begin(view)
+        seconds = self._seconds_since(view)
+        match, twist = self._match(view, seconds)
+        is_second = self._first is not None and not self._is_wrong(match, seconds)
+        if self._first is not None and is_second:
+            match, twist = self._begin_again(self._first, view, seconds, twist)
+        view.clock.lap("track")
+        if wrong := self._is_wrong(match, seconds):
+            return self._lose(view, wrong)
+        return self._go_on(view, match, twist, seconds, is_second)
+
+    def make_keyframe(self) -> Keyframe | None:
+        """Make the last sweep a keyframe if it is to be one, and return it; else None."""
+        wanted, self._wanted = self._wanted, None
+        if wanted is not None:
+            self._made = self._add_keyframe(wanted)
+        made, self._made = self._made, None
+        return None if made is None else self._map.keyframe(made)
+
+    # ---- the ways a sweep can go ----
+
+    def _begin(self, view: CloudView) -> Estimate:
+        """Begin a map with a sweep; how the body moved over it, nobody knows yet."""
+        self._start(view)
+        k = self._new_keyframe(view, np.eye(4), np.zeros((6, 6)))
+        placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
+        return self._placed(view, placed, Status.TRACKING, "", len(view))
+
+    def _start(self, view: CloudView) -> None:
+        """Begin the front-end's map with a sweep."""
+        self._front_end.clear()
+        self._T_odom_middle, self._T_odom_body = np.eye(4), np.eye(4)
+        self._twist, self._lost, self._first = np.zeros(6), 0, view
+        self._front_end.insert(view.prepared, self._T_odom_middle, self._twist)
+        self._middle_ns = max(_middle_ns(view), self._middle_ns)
+
+    def _begin_again(
+        self, first: CloudView, view: CloudView, seconds: float, twist: Array
+    ) -> tuple[SweepMatch, Array]:
+        """Begin the map again with the first sweep deskewed, as its motion is known by now."""
+        self._first = None
+        self._front_end.clear()
+        self._T_odom_middle, self._twist = se3_exp(first.middle * twist), twist
+        self._front_end.insert(first.prepared, self._T_odom_middle, twist)
+        return self._match(view, seconds)
+
+    def _match(self, view: CloudView, seconds: float) -> tuple[SweepMatch, Array]:
+        """Lay a sweep down where it should be, and again with the motion that this gives."""
+        twist, T = self._twist, self._T_odom_middle @ se3_exp(self._twist * seconds)
+        for _ in range(self._config.rounds):
+            match = self._front_end.match(view.prepared, T, twist)
+            T = match.T_map_body
+            if seconds > 0.0:
+                twist = se3_log(se3_inverse(self._T_odom_middle) @ T) / seconds
+        return match, twist
+
+    def _is_wrong(self, match: SweepMatch, seconds: float) -> str:
+        """Say why a match cannot be; empty if it can."""
+        config = self._config
+        if match.share < config.min_share:
+            return (
+                f"only {match.share:.0%} of {match.num_points} points lie on what is known, "
+                f"{config.min_share:.0%} needed"
+            )
+        moved = se3_log(se3_inverse(self._T_odom_middle) @ match.T_map_body)
+        fast = np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])
+        if fast[0] > config.fastest * max(seconds, 0.1):
+            return f"it would have moved by {fast[0]:.1f} m in {seconds:.2g} s"
+        return ""
+
+    def _go_on(
+        self, view: CloudView, match: SweepMatch, twist: Array, seconds: float, is_second: bool
+    ) -> Estimate:
+        """Take a match as found; the second sweep becomes a keyframe, as the first has no cloud."""
+        T_step = se3_inverse(self._T_odom_middle) @ match.T_map_body
+        step = self._step_covariance(match, seconds)
+        Ad = se3_adjoint(se3_inverse(T_step))
+        self._drift = Ad @ self._drift @ Ad.T + self._config.renewal * step
+        self._step = step
+        self._T_odom_middle, self._twist = match.T_map_body, twist
+        self._middle_ns = max(_middle_ns(view), self._middle_ns)
+        self._front_end.insert(view.prepared, self._T_odom_middle, twist)
+        view.clock.lap("insert")
+        self._T_odom_body = self._T_odom_middle @ se3_exp(-view.middle * twist)
+        T_keyframe_body = se3_inverse(self._T_odom_keyframe) @ self._T_odom_body
+        covariance = self._drift + step
+        placed = Placed(view.frame.stamp_ns, self._keyframe, T_keyframe_body, covariance)
+        status = Status.RECOVERED if self._lost else Status.TRACKING
+        self._lost = 0
+        moved = se3_log(T_keyframe_body)
+        is_far = np.linalg.norm(moved[:3]) > self._config.keyframe_m
+        is_turned = np.linalg.norm(moved[3:]) > self._config.keyframe_rad
+        if self._is_mapping and (is_far or is_turned or is_second):
+            self._wanted = _Wanted(view, twist)
+        return self._placed(view, placed, status, match.reason, match.num_inliers)
+
+    def _pass_over(self, view: CloudView, reason: str) -> Estimate:
+        """Say that a sweep says nothing."""
+        if self._keyframe < 0:
+            identity = SE3.identity()
+            return Estimate(
+                view.frame.id, view.frame.stamp_ns, Status.INITIALIZING, reason, -1, identity,
+                identity, np.zeros((6, 6)), timing=view.clock.laps,
+            )  # fmt: skip
+        return self._lose(view, reason)
+
+    def _lose(self, view: CloudView, reason: str) -> Estimate:
+        """Say that this sweep has no pose; after many of them, begin a piece of the map."""
+        self._lost += 1
+        is_long = self._lost > self._config.patience
+        if is_long and self._is_mapping and not view.says_nothing(self._config.min_points):
+            return self._begin_piece(view)
+        last = self.path.last
+        return Estimate(
+            view.frame.id, view.frame.stamp_ns, Status.LOST, reason, last.keyframe_id,
+            SE3(last.T_keyframe_body), SE3(self.path.last_pose()),
+            self.path.gap_covariance(view.frame.stamp_ns), timing=view.clock.laps,
+        )  # fmt: skip
+
+    def _begin_piece(self, view: CloudView) -> Estimate:
+        """Begin a piece of the map of which nothing is known relative to the others."""
+        last, unsure = self.path.last_pose(), self.path.gap_covariance(view.frame.stamp_ns)
+        self._start(view)
+        k = self._new_keyframe(view, last, unsure)
+        self._map.begin_piece(k)
+        placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
+        return self._placed(view, placed, Status.INITIALIZING, ANEW, len(view))
+
+    # ---- parts ----
+
+    def _seconds_since(self, view: CloudView) -> float:
+        """Return the time since the last sweep that was placed; stamps that jump back took none."""
+        return float(np.clip((_middle_ns(view) - self._middle_ns) * 1e-9, 0.0, LONGEST_S))
+
+    def _step_covariance(self, match: SweepMatch, seconds: float) -> Array:
+        """Return (6, 6) of the step: what is matched, and how bodies can move at all."""
+        config = self._config
+        sigma = config.acceleration * seconds**2 + 1e-3, config.angular * seconds**2 + 1e-3
+        if self._lost:
+            sigma = sigma[0] + config.unseen * seconds, sigma[1] + config.unseen_rad * seconds
+        loose = np.diag(1.0 / np.repeat(sigma, 3) ** 2)
+        return np.asarray(np.linalg.inv(loose + match.information))
+
+    def _placed(
+        self, view: CloudView, placed: Placed, status: Status, reason: str, count: int
+    ) -> Estimate:
+        """Turn a place into an estimate."""
+        correction = self.path.correction() if len(self.path) else ""
+        T_world_body, covariance = self.path.append(placed)
+        if correction and status is Status.TRACKING:
+            status, reason = Status.RECOVERED, reason or correction
+        is_keyframe = self._wanted is not None or self._made is not None
+        return Estimate(
+            view.frame.id, view.frame.stamp_ns, status, reason, placed.keyframe_id,
+            SE3(placed.T_keyframe_body), SE3(T_world_body), covariance, count, is_keyframe,
+            view.clock.laps,
+        )  # fmt: skip
+
+    def _add_keyframe(self, wanted: _Wanted) -> int:
+        """Add the sweep that was placed last to the map, tied to the keyframe before."""
+        view, last = wanted.view, self.path.last
+        in_world = self.path.covariance(last)
+        k = self._new_keyframe(view, self.path.last_pose(), in_world, wanted.twist)
+        information = np.asarray(np.linalg.inv(last.covariance))
+        self._map.add_edge(last.keyframe_id, k, last.T_keyframe_body, information, ODOMETRY)
+        self.path.replace_last(Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6))))
+        return k
+
+    def _new_keyframe(
+        self, view: CloudView, T_world_body: Array, covariance: Array, twist: Array | None = None
+    ) -> int:
+        """Add a keyframe with the sweep as of one instant, if the motion over it is known."""
+        k = self._map.new_keyframe_id()
+        cloud = None if twist is None else self._viewer.kept(view, twist)
+        keyframe = Keyframe(k, view.frame.stamp_ns, cloud=cloud)
+        self._map.add_keyframe(keyframe, T_world_body, covariance=covariance)
+        self._keyframe, self._T_odom_keyframe = k, self._T_odom_body
+        self._drift = np.zeros((6, 6))
+        self._made = k
+        return k
+
+
+def _middle_ns(view: CloudView) -> int:
+    """Return the moment of the middle of a sweep."""
+    return view.frame.stamp_ns + round(view.middle * 1e9)
