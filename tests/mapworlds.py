@@ -31,7 +31,7 @@ def rich_map(seed=0, keyframes=8):
             1_403_636_579_763_555_584 + 50_000_000 * n,
             features=None if n == 2 else features(rng, 20 + n, (32, 0, 128)[n % 3]),
             scan=np.array([1.0, np.nan, np.inf]) if n % 2 else None,
-            cloud=rng.normal(size=(4, 3 + n % 2)) if n > 4 else None,
+            cloud=rng.normal(size=(4, 3 + n % 2)).astype(np.float32) if n > 4 else None,
             imu=imu if n > 3 else None,
         )
         known = {"covariance": np.eye(6) * n, "v_world_body": rng.normal(size=3)} if n % 2 else {}

@@ -118,9 +118,12 @@ class SavedMap:
         """Make sure that something could be recognised in the map."""
         from odomap.system.recognition import describes_places
 
-        if sensors == "lidar2d":
-            if not any(self.map.keyframe(k).scan is not None for k in self.map.keyframe_ids):
-                raise InputError(f"{self.name}: the map has no scans: nothing could be localised")
+        of_lidars = {"lidar2d": "scan", "lidar3d": "cloud"}
+        if sensors in of_lidars:
+            kept = of_lidars[sensors]
+            keyframes = (self.map.keyframe(k) for k in self.map.keyframe_ids)
+            if not any(getattr(keyframe, kept) is not None for keyframe in keyframes):
+                raise InputError(f"{self.name}: the map has no {kept}s: nothing could be localised")
             return
         if not self.map.num_landmarks:
             raise InputError(f"{self.name}: the map has no landmarks: nothing could be localised")
@@ -182,6 +185,8 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
         here: the rig of a recording.
         sensors: stereo, rgbd or mono.
     """
+    if sensors == "lidar3d":
+        return  # any LiDAR sees the same surfaces
     if sensors == "lidar2d":
         yield from _lasers(there, here)
         return

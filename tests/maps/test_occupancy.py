@@ -152,7 +152,9 @@ def test_what_is_missing_is_said():
     laser, top = LidarMount("laser", angles=(-1.0, 1.0, 5)), LidarMount("top")
     empty, scans, clouds = Map(), Map(), Map()
     scans.add_keyframe(Keyframe(scans.new_keyframe_id(), 0, scan=np.ones(4)), np.eye(4))
-    clouds.add_keyframe(Keyframe(clouds.new_keyframe_id(), 0, cloud=np.ones((4, 3))), np.eye(4))
+    clouds.add_keyframe(
+        Keyframe(clouds.new_keyframe_id(), 0, cloud=np.ones((4, 3), np.float32)), np.eye(4)
+    )
     for m, rig, said in (
         (empty, Rig(lidars=(laser,)), "neither scans nor clouds"),
         (scans, Rig(lidars=(top,)), "no 2D LiDAR"),

@@ -74,6 +74,10 @@ class FrontEnd(Protocol[P]):
         """Add a sweep to the map, and forget what is far from it."""
         ...
 
+    def seed(self, points: Array) -> None:
+        """Add points (N, 3) of another map, in the frame of this one."""
+        ...
+
     def clear(self) -> None:
         """Forget the map."""
         ...

@@ -89,11 +89,19 @@ class PlaneFrontEnd:
 
     def insert(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> None:
         """Add a sweep, and forget what is far."""
+        points = deskew(prepared.points, prepared.times, twist)
+        surfaces = self._surfaces()
+        surfaces.insert(points @ T_map_body[:3, :3].T + T_map_body[:3, 3])
+        surfaces.evict(T_map_body[:3, 3], self._config.farthest * surfaces.voxel)
+
+    def seed(self, points: Array) -> None:
+        """Add points (N, 3) of another map, in the frame of this one."""
+        self._surfaces().insert(points)
+
+    def _surfaces(self) -> PlaneMap:
         if self._map is None:
             self._map = PlaneMap(self._voxel or 1.0, self._config.sigma * (self._voxel or 1.0))
-        points = deskew(prepared.points, prepared.times, twist)
-        self._map.insert(points @ T_map_body[:3, :3].T + T_map_body[:3, 3])
-        self._map.evict(T_map_body[:3, 3], self._config.farthest * self._map.voxel)
+        return self._map
 
     def clear(self) -> None:
         """Forget the map."""

@@ -46,6 +46,12 @@ class CloudTrackingConfig:
     """The same of a rotation, rad/s."""
     renewal: NotNegative = 1.0
     """Share of a step's error that goes into the map, and stays."""
+    seeks_after: Count = 3
+    """Sweeps in a row that are placed nowhere, after which the whole map is searched for them."""
+    around: Positive = 50.0
+    """How far around a body that was recognised the map is matched with, metres."""
+    left: Positive = 10.0
+    """How far a body that is only placed goes until that is made anew, metres."""
     patience: Count = 10
     """Sweeps in a row that are placed nowhere, after which a piece of the map is begun."""
     keyframe_m: Positive = 2.0

@@ -87,7 +87,9 @@ class CloudFinder:
         self._places: Places | None = None
         self._version = -1
 
-    def find(self, points: Array, T_world_body: Array | None = None) -> FoundCloud | str:
+    def find(
+        self, points: NDArray[np.floating], T_world_body: Array | None = None
+    ) -> FoundCloud | str:
         """Find where a sweep was taken.
 
         Args:
@@ -98,17 +100,17 @@ class CloudFinder:
         Returns:
             Where; or why that cannot be told.
         """
-        points = np.ascontiguousarray(points[:, :3], np.float64)
-        if len(points) < FEWEST:
-            return f"{len(points)} points of {FEWEST} needed to recognise a place"
+        seen: Array = np.ascontiguousarray(points[:, :3], np.float64)
+        if len(seen) < FEWEST:
+            return f"{len(seen)} points of {FEWEST} needed to recognise a place"
         if not self._map.num_keyframes:
             return "there is no keyframe in the map"
         places = self._read()
         T = np.eye(4)
         T[2, :3] = self._up(places, T_world_body)
-        looks = self._search.looks(points, T[2, :3])
+        looks = self._search.looks(seen, T[2, :3])
         candidates = self._search.alike(places, T, looks, np.ones(len(places.ids), bool))
-        laid = [self._judge.lay(places, each, points, T[2, :3]) for each in candidates]
+        laid = [self._judge.lay(places, each, seen, T[2, :3]) for each in candidates]
         return self._decided(places, laid)
 
     def _read(self) -> Places:

@@ -15,11 +15,12 @@ from odomap.errors import CalibrationError, ConfigError
 from odomap.lidar.frontend import FrontEnd
 from odomap.maps.map import Map
 from odomap.sensors.rig import LidarMount, Rig
+from odomap.system.cloudrecognition import CloudFinder
 from odomap.system.cloudtracking import CloudTracker
 from odomap.system.cloudview import CloudViewer
 from odomap.system.config import Config, preset
 from odomap.system.path import Path
-from odomap.system.stages import Stages
+from odomap.system.stages import Closer, Stages
 from odomap.system.system import System
 from odomap.vision.vocabulary import VocabularyTree
 
@@ -62,8 +63,18 @@ class CloudSlam(System):
         config = self._config.cloud_tracking
         front_end = self._front_end()
         viewer = CloudViewer(self._mount, front_end, config)
-        self._tracker = CloudTracker(self.map, viewer, front_end, config, self._is_mapping)
-        return Stages(self.map, self._tracker)
+        sections = self._config.cloud_recognition, self._config.cloud_closing
+        finder = CloudFinder(self.map, viewer.T_body_lidar, *sections)
+        parts = self.map, viewer, front_end, finder, config
+        self._tracker = CloudTracker(*parts, self._is_mapping)
+        return Stages(self.map, self._tracker, None, self._closer() if self._is_mapping else None)
+
+    def _closer(self) -> Closer | None:
+        if not self._config.cloud_closing.enabled:
+            return None
+        from odomap.system.cloudclosing import CloudCloser  # what compiles pose graphs
+
+        return CloudCloser(self.map, self._mount.T_body_lidar.matrix, self._config.cloud_closing)
 
     def _front_end(self) -> FrontEnd[Any]:
         from odomap.lidar.planefrontend import PlaneFrontEnd

@@ -1,8 +1,7 @@
 """Tracking with a 3D LiDAR: every sweep is laid onto what the sweeps before it saw.
 
-Where the body is by now is predicted: it goes on as before, ξ being its motion per second. From
-there the front-end finds it on its map (`lidar/frontend`), with the sweep deskewed by ξ; that gives
-a better ξ, and with it the sweep is deskewed and laid down once more:
+The body goes on as before, ξ being its motion per second. From there the front-end finds it on its
+map (`lidar/frontend`), the sweep deskewed by ξ; that gives a better ξ, and with it once more:
 
     x̂ = x exp(ξ Δt),     x = match(x̂, ξ),     ξ = log(x_before⁻¹ x) / Δt
 
@@ -11,9 +10,8 @@ least; where the body was at the stamp lies between two such poses, x exp(-ξ τ
 middle.
 
 The map of the front-end is in a frame of odometry that nothing ever moves; a frame hangs from its
-keyframe by T_keyframe_body = T_odom_keyframe⁻¹ T_odom_body, so that loops move keyframes and never
-pull the tracker from under its feet. What a match says of the step is weighed against how a body
-can move at all,
+keyframe, and loops move those and never pull the tracker from under its feet. What a match says of
+a step is weighed against how a body can move at all,
 
     P_step = (Q⁻¹ + Λ)⁻¹,        Q = diag(σ_a Δt², σ_ω Δt)²,
 
@@ -37,12 +35,14 @@ from odomap.errors import CalibrationError
 from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
 from odomap.lidar.frontend import FrontEnd, SweepMatch
-from odomap.maps.edges import ODOMETRY
+from odomap.maps.edges import LOOP, ODOMETRY
 from odomap.maps.estimate import Estimate, Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.cloudconfig import CloudTrackingConfig
+from odomap.system.cloudrecognition import CloudFinder, FoundCloud
+from odomap.system.cloudsurroundings import Surroundings
 from odomap.system.cloudview import CloudView, CloudViewer
 from odomap.system.path import Path, Placed
 
@@ -70,6 +70,7 @@ class CloudTracker:
         map: where keyframes go.
         viewer: makes sweeps ready.
         front_end: lays them onto each other.
+        finder: finds them in the map.
         config: how.
         is_mapping: whether sweeps become keyframes.
 
@@ -82,11 +83,13 @@ class CloudTracker:
         map: Map,
         viewer: CloudViewer,
         front_end: FrontEnd[Any],
+        finder: CloudFinder,
         config: CloudTrackingConfig,
         is_mapping: bool = True,
     ) -> None:
         self._map, self._viewer, self._front_end, self._config = map, viewer, front_end, config
-        self._is_mapping = is_mapping
+        self._finder, self._is_mapping = finder, is_mapping
+        self._around = Surroundings(map, viewer.T_body_lidar, config)
         self.path = Path(map)
         self._T_odom_middle, self._twist = np.eye(4), np.zeros(6)
         self._middle_ns = 0
@@ -143,7 +146,14 @@ class CloudTracker:
     # ---- the ways a sweep can go ----
 
     def _begin(self, view: CloudView) -> Estimate:
-        """Begin a map with a sweep; how the body moved over it, nobody knows yet."""
+        """Begin a map with a sweep, or find it in the one that there is."""
+        if self._map.num_keyframes:
+            found = self._finder.find(self._viewer.kept(view, self._twist))
+            view.clock.lap("track")
+            if isinstance(found, str):
+                return self._pass_over(view, f"not recognised: {found}")
+            return self._enter(view, found, Status.TRACKING)
+        # How the body moved over it nobody knows yet, so nothing of it is kept.
         self._start(view)
         k = self._new_keyframe(view, np.eye(4), np.zeros((6, 6)))
         placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
@@ -202,9 +212,12 @@ class CloudTracker:
         self._step = step
         self._T_odom_middle, self._twist = match.T_map_body, twist
         self._middle_ns = max(_middle_ns(view), self._middle_ns)
-        self._front_end.insert(view.prepared, self._T_odom_middle, twist)
-        view.clock.lap("insert")
         self._T_odom_body = self._T_odom_middle @ se3_exp(-view.middle * twist)
+        if self._is_mapping:
+            self._front_end.insert(view.prepared, self._T_odom_middle, twist)
+        elif self._around.is_left(self._T_odom_body):
+            self._hang_anew()
+        view.clock.lap("insert")
         T_keyframe_body = se3_inverse(self._T_odom_keyframe) @ self._T_odom_body
         covariance = self._drift + step
         placed = Placed(view.frame.stamp_ns, self._keyframe, T_keyframe_body, covariance)
@@ -233,12 +246,40 @@ class CloudTracker:
         is_long = self._lost > self._config.patience
         if is_long and self._is_mapping and not view.says_nothing(self._config.min_points):
             return self._begin_piece(view)
+        if self._lost >= self._config.seeks_after and view.prepared is not None:
+            seen = self._viewer.kept(view, np.zeros(6))
+            found = self._finder.find(seen, self.path.last_pose())
+            view.clock.lap("track")
+            if not isinstance(found, str):
+                return self._enter(view, found, Status.RECOVERED)
+            reason = f"{reason}; {found}"
         last = self.path.last
         return Estimate(
             view.frame.id, view.frame.stamp_ns, Status.LOST, reason, last.keyframe_id,
             SE3(last.T_keyframe_body), SE3(self.path.last_pose()),
             self.path.gap_covariance(view.frame.stamp_ns), timing=view.clock.laps,
         )  # fmt: skip
+
+    def _enter(self, view: CloudView, found: FoundCloud, status: Status) -> Estimate:
+        """Go on in the map, where a sweep was recognised."""
+        k, stamp_ns = found.keyframe_id, view.frame.stamp_ns
+        T_world_keyframe = self._map.T_world_body(k)
+        self._start(view)
+        self._first = None
+        self._T_odom_body = self._T_odom_middle = T_world_keyframe @ found.T_keyframe_body
+        self._keyframe, self._T_odom_keyframe = k, T_world_keyframe
+        self._drift = np.zeros((6, 6))
+        self._step = np.asarray(np.linalg.inv(found.information))
+        self._front_end.clear()
+        self._around.surround(self._front_end, self._T_odom_body)
+        placed = Placed(stamp_ns, k, found.T_keyframe_body, self._step)
+        if not self._is_mapping:
+            return self._placed(view, placed, status, "", found.num_inliers)
+        sure = self.path.covariance(placed)
+        made = self._new_keyframe(view, self._T_odom_body, sure, self._twist, parent=k)
+        self._map.add_edge(k, made, found.T_keyframe_body, found.information, LOOP)
+        placed = Placed(stamp_ns, made, np.eye(4), np.zeros((6, 6)))
+        return self._placed(view, placed, status, "", found.num_inliers)
 
     def _begin_piece(self, view: CloudView) -> Estimate:
         """Begin a piece of the map of which nothing is known relative to the others."""
@@ -254,6 +295,13 @@ class CloudTracker:
     def _seconds_since(self, view: CloudView) -> float:
         """Return the time since the last sweep that was placed; stamps that jump back took none."""
         return float(np.clip((_middle_ns(view) - self._middle_ns) * 1e-9, 0.0, LONGEST_S))
+
+    def _hang_anew(self) -> None:
+        """Surround a body that is only placed in the map with what is there, and hang it anew."""
+        self._front_end.clear()
+        k = self._around.surround(self._front_end, self._T_odom_body)
+        self._keyframe, self._T_odom_keyframe = k, self._map.T_world_body(k)
+        self._drift = np.zeros((6, 6))
 
     def _step_covariance(self, match: SweepMatch, seconds: float) -> Array:
         """Return (6, 6) of the step: what is matched, and how bodies can move at all."""
@@ -290,13 +338,14 @@ class CloudTracker:
         return k
 
     def _new_keyframe(
-        self, view: CloudView, T_world_body: Array, covariance: Array, twist: Array | None = None
-    ) -> int:
+        self, view: CloudView, T_world_body: Array, covariance: Array, twist: Array | None = None,
+        parent: int = -1,
+    ) -> int:  # fmt: skip
         """Add a keyframe with the sweep as of one instant, if the motion over it is known."""
         k = self._map.new_keyframe_id()
         cloud = None if twist is None else self._viewer.kept(view, twist)
         keyframe = Keyframe(k, view.frame.stamp_ns, cloud=cloud)
-        self._map.add_keyframe(keyframe, T_world_body, covariance=covariance)
+        self._map.add_keyframe(keyframe, T_world_body, parent=parent, covariance=covariance)
         self._keyframe, self._T_odom_keyframe = k, self._T_odom_body
         self._drift = np.zeros((6, 6))
         self._made = k

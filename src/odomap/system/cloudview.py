@@ -79,13 +79,17 @@ class CloudViewer:
         mount: of the LiDAR.
         front_end: says what is to be prepared.
         config: how far points are used, and how thin keyframes keep them.
+
+    Attributes:
+        T_body_lidar: (4, 4) where the LiDAR is on the body.
     """
 
     def __init__(
         self, mount: LidarMount, front_end: FrontEnd[Any], config: CloudTrackingConfig
     ) -> None:
         self._mount, self._front_end, self._config = mount, front_end, config
-        self._T_lidar_body = se3_inverse(mount.T_body_lidar.matrix)
+        self.T_body_lidar = mount.T_body_lidar.matrix
+        self._T_lidar_body = se3_inverse(self.T_body_lidar)
 
     def view(self, frame: Frame) -> CloudView:
         """Make a frame's sweep ready."""

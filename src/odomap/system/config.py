@@ -26,7 +26,11 @@ from odomap.system.association import (
 )
 from odomap.system.background import ThreadConfig
 from odomap.system.candidates import CandidateConfig
-from odomap.system.cloudconfig import CloudTrackingConfig
+from odomap.system.cloudconfig import (
+    CloudClosingConfig,
+    CloudRecognitionConfig,
+    CloudTrackingConfig,
+)
 from odomap.system.creating import CreateConfig
 from odomap.system.culling import CullConfig
 from odomap.system.fusing import FuseConfig
@@ -126,6 +130,10 @@ class Config:
     """How sweeps are laid onto surfaces."""
     cloud_tracking: CloudTrackingConfig = field(default_factory=CloudTrackingConfig)
     """How sweeps are placed and when one becomes a keyframe."""
+    cloud_recognition: CloudRecognitionConfig = field(default_factory=CloudRecognitionConfig)
+    """What a sweep must show to be recognised in a map."""
+    cloud_closing: CloudClosingConfig = field(default_factory=CloudClosingConfig)
+    """When places seen before are searched for, and the path is corrected."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 
