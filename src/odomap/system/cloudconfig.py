@@ -106,7 +106,7 @@ class CloudClosingConfig:
     """Farthest that points of the two may be apart then, metres."""
     overlap: Fraction = 0.6
     """Share of a cloud that must meet what is known."""
-    agree: Fraction = 0.15
+    agree: Fraction = 0.05
     """Share of what stands up in one sweep that the other must have seen, too."""
     against: Fraction = 0.05
     """Share of that which the other may have looked through, relative to both."""
@@ -131,7 +131,7 @@ class CloudRecognitionConfig:
 
     alike: Fraction = 0.5
     """Largest distance of how it looks and how a place does."""
-    most: Count = 4
+    most: Count = 6
     """Places that it is laid onto."""
     overlap: Fraction = 0.7
     """Share of it that must meet what is known."""

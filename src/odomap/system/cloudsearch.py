@@ -35,8 +35,8 @@ SIGMAS = 3.0
 """Standard deviations of the path that are searched."""
 SIDESTEP = 2.0
 """How far apart the places beside are that a cloud is described from, metres."""
-ANOTHER = 15.0
-"""How far along the path places must be to be tried both, metres."""
+ANOTHER = 6.0
+"""How far apart places must be to be tried both, metres: along a road they look much the same."""
 BATCH = 50
 """Keyframes of a loaded map that are described at a time."""
 
