@@ -85,7 +85,7 @@ def test_what_was_not_tied_to_what_is_known_stays(street):
     drive.go()
     stage = closer(drive)
     places = read_places(drive.map, np.eye(4))
-    assert stage.plan(places, np.arange(len(places.ids) - 20)) is None
+    assert stage.plan(places, len(places.ids)) is None
 
 
 def test_what_is_new_stays(street):

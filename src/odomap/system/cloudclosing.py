@@ -27,7 +27,7 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.cloudconfig import CloudClosingConfig
 from odomap.system.cloudgraph import CloudPath, Tie, graph_of
-from odomap.system.cloudplaces import Places, cloud_points, read_places
+from odomap.system.cloudplaces import MapCopy, Places, cloud_points, copy_map, places_of
 from odomap.system.cloudsearch import Candidate, CloudSearch
 from odomap.system.cloudverifying import CloudJudge
 from odomap.system.correction import correction
@@ -64,31 +64,33 @@ class CloudCloser:
     def add(self, keyframe: Keyframe) -> "CloudClosingJob | None":
         """Read the map as it is."""
         self._since_solved += 1
-        places = read_places(self._map, self._T_body_lidar)
         if not self._map.is_keyframe_alive(keyframe.id):  # it went while it waited
             return None
-        here = places.Ts_world_body[places.row(keyframe.id), :3, 3]
+        here = self._map.T_world_body(keyframe.id)[:3, 3]
         is_apart = self._tied_at is None or (
             float(np.linalg.norm(here - self._tied_at)) >= self._config.apart
         )
-        return CloudClosingJob(self, keyframe, is_apart, places, self._is_due(places))
+        return CloudClosingJob(self, keyframe, is_apart, copy_map(self._map), self._is_due())
 
     def last(self) -> "CloudClosingJob | None":
         """Read the map at the end of a run, if it was not solved since the last loop."""
         if not self._pending:
             return None
-        places = read_places(self._map, self._T_body_lidar)
-        return CloudClosingJob(self, None, False, places, True)
+        return CloudClosingJob(self, None, False, copy_map(self._map), True)
 
     def expect(self) -> None:
         """Take notice of a loop that somebody else closed: the path is to be solved."""
         self._pending += 1
 
-    def _is_due(self, places: Places) -> bool:
-        least = max(self._config.solve_every, self._config.solve_share * len(places.ids))
+    def _is_due(self) -> bool:
+        least = max(self._config.solve_every, self._config.solve_share * self._map.num_keyframes)
         return self._pending > 0 and self._since_solved >= least
 
     # ---- without the map ----
+
+    def places(self, copy: MapCopy) -> Places:
+        """Return the places of the map that was copied."""
+        return places_of(copy, self._T_body_lidar)
 
     def find(
         self, keyframe: Keyframe, places: Places, looks_back: bool
@@ -191,12 +193,13 @@ class CloudClosingJob:
     closer: CloudCloser
     keyframe: Keyframe | None
     looks_back: bool
-    places: Places
+    copy: MapCopy
     is_due: bool
 
     def solve(self) -> "CloudClosingChange":
         """Search, lay and solve."""
-        places, closer = self.places, self.closer
+        closer = self.closer
+        places = known = closer.places(self.copy)
         ties: list[Tie] = []
         refused: list[Loop] = []
         if self.keyframe is not None:
@@ -204,16 +207,16 @@ class CloudClosingJob:
         for tie in ties[:1]:
             places, ties, why = closer.agreed(places, tie)
             refused += [_refused(tie, why)] if why else []
-        merges = places is not self.places
+        merges = places is not known
         path, doubts = None, frozenset[Pair]()
-        if self.is_due or closer.is_off(self.places, ties):
+        if self.is_due or closer.is_off(known, ties):
             path = closer.solve(places, ties)
             doubts = path.false - closer.false - {tie.ends for tie in ties}
             for tie in [tie for tie in ties if tie.ends in path.false]:
                 ties.remove(tie)
-                refused.append(_refused(tie, _contradiction(self.places, tie)))
-        told = _told(self.places, ties, sorted(doubts), merges)
-        return CloudClosingChange(closer, self.places, ties, (*told, *refused), path)
+                refused.append(_refused(tie, _contradiction(known, tie)))
+        told = _told(known, ties, sorted(doubts), merges)
+        return CloudClosingChange(closer, known, ties, (*told, *refused), path)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,15 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot
 
-__all__ = ["CloudPlaces", "Places", "cloud_points", "read_places"]
+__all__ = [
+    "CloudPlaces",
+    "MapCopy",
+    "Places",
+    "cloud_points",
+    "copy_map",
+    "places_of",
+    "read_places",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -90,6 +98,28 @@ class Places:
         return np.asarray(BENT * steps.sum(axis=0))
 
 
+@dataclass(frozen=True, eq=False)
+class MapCopy:
+    """What was copied of a map.
+
+    Attributes:
+        snapshot: poses and keyframes.
+        covariances: (K, 6, 6) of the poses.
+        edges: all there are.
+    """
+
+    snapshot: Snapshot
+    covariances: Array
+    edges: EdgeTable
+
+
+def copy_map(map: Map) -> MapCopy:
+    """Copy what is needed of a map, and nothing else: it is waited for."""
+    with map.lock:
+        snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
+        return MapCopy(snapshot, map.covariances(snapshot.keyframe_ids), map.edges())
+
+
 def read_places(map: Map, T_body_lidar: Array) -> Places:
     """Read a map of clouds.
 
@@ -97,10 +127,12 @@ def read_places(map: Map, T_body_lidar: Array) -> Places:
         map: keyframes with clouds, and edges.
         T_body_lidar: (4, 4) where the LiDAR is on the body.
     """
-    with map.lock:
-        snapshot = map.snapshot(map.keyframe_ids, landmarks=False)
-        edges = map.edges()
-        covariances = map.covariances(snapshot.keyframe_ids)
+    return places_of(copy_map(map), T_body_lidar)
+
+
+def places_of(copy: MapCopy, T_body_lidar: Array) -> Places:
+    """Return the places of a map that was copied."""
+    snapshot, covariances, edges = copy.snapshot, copy.covariances, copy.edges
     order = np.argsort(snapshot.keyframe_ids)
     ids, Ts = snapshot.keyframe_ids[order], snapshot.Ts_world_body[order]
     variance = np.trace(covariances[order, :3, :3], axis1=1, axis2=2)

@@ -64,14 +64,9 @@ class CloudThinner:
         self._next = 0
 
     def add(self, keyframe: Keyframe) -> "_Job | None":
-        """Read what the closer needs of the map, and choose what is looked at."""
+        """Read what the closer needs of the map."""
         job = self._closer.add(keyframe)
-        if job is None:
-            return None
-        ids = job.places.ids
-        last = len(ids) - self._config.settled
-        rows = np.arange(max(last, 0))[ids[: max(last, 0)] >= self._next][:MOST]
-        return _Job(self, job, rows)
+        return None if job is None else _Job(self, job)
 
     def last(self) -> CloudClosingJob | None:
         """Read what is left to be done at the end."""
@@ -81,13 +76,15 @@ class CloudThinner:
         """Take notice of a loop that somebody else closed."""
         self._closer.expect()
 
-    def plan(self, places: Places, rows: Index) -> "_Plan | None":
-        """Say which of some keyframes go, and what becomes of what hung from them.
+    def plan(self, places: Places, most: int = MOST) -> "_Plan | None":
+        """Look at keyframes that are settled, and say which go, and what becomes of the map.
 
         Args:
             places: of the map.
-            rows: of the keyframes that are looked at.
+            most: how many are looked at; the next ones at the next call.
         """
+        settled = places.ids[: max(len(places.ids) - self._config.settled, 0)]
+        rows = np.flatnonzero(settled >= self._next)[:most]
         if not len(rows):
             return None
         self._next = int(places.ids[rows[-1]]) + 1
@@ -121,17 +118,16 @@ class CloudThinner:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A closer's job, and keyframes to be looked at."""
+    """A closer's job, after which keyframes are looked at."""
 
     thinner: CloudThinner
     job: CloudClosingJob
-    rows: Index
 
     def solve(self) -> "_Thinned":
         """Do the closer's job, and where it leaves the path as it is, find what is redundant."""
-        change, places = self.job.solve(), self.job.places
-        plan = None if change.path is not None else self.thinner.plan(places, self.rows)
-        return _Thinned(change, len(places.edges.kind), plan)
+        change = self.job.solve()
+        plan = None if change.path is not None else self.thinner.plan(change.places)
+        return _Thinned(change, len(change.places.edges.kind), plan)
 
 
 @dataclass(frozen=True, eq=False)
