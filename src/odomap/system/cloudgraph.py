@@ -2,11 +2,10 @@
 
     min over T_k   Σ_step |T_i⁻¹ T_j ⊖ Z|²_Λ  +  Σ_loop ρ( |T_i⁻¹ T_j ⊖ Z|²_Λ ),
 
-in SE(3), from the path as it is, with Cauchy's loss. Some loops are false, though the clouds fit:
-graduated non-convexity decides which of them the others and the path contradict, with all standard
-deviations larger, as odometry errs by the same from step to step, which nobody told of. Loops
-that are new are decided on with all others before any is written; those that do not hold are named,
-new ones as refused, earlier ones as not believed any more.
+in SE(3), from the path as it is. Some loops are false, though the clouds fit: it is decided which
+of them the others and the path contradict (`loopgraph`). Loops that are new are decided on with all
+others before any is written; those that do not hold are named, new ones as refused, earlier ones as
+not believed any more.
 
 Across gaps nothing was measured; an edge that draws nothing keeps the graph in one piece until
 loops tie the two. Covariances are the graph's marginals, relative to the first keyframe.
@@ -18,21 +17,17 @@ spatial perception", RA-L 5(2), 2020.
 """
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.descent import SolverConfig
-from odomap.backend.graphs.covariances import GraphCovariances
-from odomap.backend.graphs.gnc import find_inliers
-from odomap.backend.graphs.solve import solve
 from odomap.geometry.lie import orthonormalize, se3_inverse
-from odomap.geometry.robust import Loss
 from odomap.maps.edges import FOLDED, GAP, LOOP, ODOMETRY
 from odomap.system.cloudconfig import CloudClosingConfig
 from odomap.system.cloudplaces import Places
 from odomap.system.essentialgraph import EssentialGraph
+from odomap.system.loopgraph import solve_loops
 
 __all__ = ["CloudGraph", "CloudPath", "Tie", "graph_of"]
 
@@ -43,8 +38,6 @@ Pair = tuple[int, int]
 
 UNKNOWN = np.diag([1e-4] * 3 + [0.1] * 3)
 """Information of the step from one piece of the map to the next: it keeps the graph in one."""
-STEPS = 10
-"""Steps of a solution at most; the path as it is is near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,25 +111,12 @@ class CloudGraph:
             config: how far loops may be off.
             decides: whether it is decided anew which loops are false.
         """
-        graph, is_true = self._graph(), ~self.is_false
-        if decides and self.is_loop.any():
-            inliers = find_inliers(graph, np.full(len(self.i), config.doubt**-2))
-            is_true = inliers.is_inlier | ~self.is_loop
-            graph = graph.placed(inliers.Ts_world_node)
-        solution = solve(
-            graph,
-            initial="given",
-            loss=Loss("cauchy", config.outlying),
-            weights=is_true.astype(np.float64),
-            config=SolverConfig(iterations=STEPS),
-        )
-        information = self.information * solution.weights[:, None, None]
-        weighed = replace(solution.graph, information=information).without(~is_true)
-        Ts = np.array(solution.Ts_world_node)
+        limits = config.doubt, config.outlying
+        solved = solve_loops(self._graph(), self.is_false, *limits, decides)
+        Ts, is_false = np.array(solved.Ts_world_node), ~solved.is_true
         Ts[:, :3, :3] = orthonormalize(Ts[:, :3, :3])
-        false = zip(self.j[~is_true].tolist(), self.i[~is_true].tolist(), strict=True)
-        covariances = GraphCovariances(weighed).marginals()
-        return CloudPath(self.keyframe_ids, Ts, covariances, frozenset(false))
+        false = zip(self.j[is_false].tolist(), self.i[is_false].tolist(), strict=True)
+        return CloudPath(self.keyframe_ids, Ts, solved.covariances, frozenset(false))
 
     def _graph(self) -> EssentialGraph:
         """Return the graph of keyframes, the first of which stays."""

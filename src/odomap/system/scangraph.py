@@ -16,15 +16,11 @@ Reference: K. Konolige et al., "Efficient sparse pose adjustment for 2D mapping"
 """
 
 from collections.abc import Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.descent import SolverConfig
-from odomap.backend.graphs.covariances import GraphCovariances
-from odomap.backend.graphs.gnc import find_inliers
-from odomap.backend.graphs.solve import solve
 from odomap.geometry.planar import (
     IN_PLANE,
     between_planar,
@@ -33,11 +29,11 @@ from odomap.geometry.planar import (
     planar_matrix,
     to_plane,
 )
-from odomap.geometry.robust import Loss
 from odomap.maps.edges import FOLDED, GAP, LOOP, ODOMETRY
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot
 from odomap.system.essentialgraph import EssentialGraph
+from odomap.system.loopgraph import solve_loops
 from odomap.system.scanconfig import ScanClosingConfig
 from odomap.system.submaps import SUBMAP
 
@@ -49,8 +45,6 @@ Pair = tuple[int, int]
 
 UNKNOWN = np.diag([1e-4, 1e-4, 0.1])
 """Information of the step from one piece of the map to the next: it keeps the graph in one."""
-STEPS = 10
-"""Steps of a solution at most; the path as it is is near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,28 +95,17 @@ class ScanGraph:
             decides: whether it is decided anew which loops are false.
         """
         order = np.argsort(self.snapshot.keyframe_ids)
-        edges, is_true = self._edges(order), ~self.is_false
-        if decides:
-            inliers = find_inliers(edges, np.full(len(self.i), config.doubt**-2))
-            is_true = inliers.is_inlier | ~self.is_loop
-            edges = edges.placed(inliers.Ts_world_node)
-        solution = solve(
-            edges,
-            initial="given",
-            loss=Loss("cauchy", config.outlying),
-            weights=is_true.astype(np.float64),
-            config=SolverConfig(iterations=STEPS),
-        )
-        information = self.information * solution.weights[:, None, None]
-        weighed = replace(solution.graph, information=information).without(~is_true)
-        T = solution.Ts_world_node  # rotations to the digits of a solver: made anew from headings
+        limits = config.doubt, config.outlying
+        solved = solve_loops(self._edges(order), self.is_false, *limits, decides)
+        T = solved.Ts_world_node  # rotations to the digits of a solver: made anew from headings
         x = np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
+        is_false = ~solved.is_true
         return ScanPath(
             self.snapshot.keyframe_ids[order],
             order,
             from_plane(x),
-            lift_covariance(GraphCovariances(weighed).marginals()),
-            np.stack([self.j[~is_true], self.i[~is_true]], axis=1),
+            lift_covariance(solved.covariances),
+            np.stack([self.j[is_false], self.i[is_false]], axis=1),
         )
 
     def _edges(self, order: Index) -> EssentialGraph:
