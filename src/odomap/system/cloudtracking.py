@@ -51,6 +51,10 @@ __all__ = ["CloudTracker"]
 Array = NDArray[np.float64]
 
 ANEW = "started anew where it was last: how it moved since is not known"
+AGAIN = 2
+"""How often the first sweep is laid down again, each time with the motion found before."""
+LEARNING = 0.1
+"""Weight of the last sweep in how unsteady the motion is."""
 LONGEST_S = 1.0
 """Time over which a body is taken to go on as before."""
 
@@ -97,6 +101,7 @@ class CloudTracker:
         self._keyframe, self._T_odom_keyframe = -1, np.eye(4)
         self._drift = np.zeros((6, 6))
         self._step = np.zeros((6, 6))
+        self._unsteady2 = np.zeros(6)
         self._wanted: _Wanted | None = None
         self._made: int | None = None
         self._before: CloudView | None = None
@@ -172,10 +177,13 @@ class CloudTracker:
     ) -> tuple[SweepMatch, Array]:
         """Begin the map again with the first sweep deskewed, as its motion is known by now."""
         self._first = None
-        self._front_end.clear()
-        self._T_odom_middle, self._twist = se3_exp(first.middle * twist), twist
-        self._front_end.insert(first.prepared, self._T_odom_middle, twist)
-        return self._match(view, seconds)
+        for _ in range(AGAIN):
+            self._front_end.clear()
+            self._T_odom_middle, self._twist = se3_exp(first.middle * twist), twist
+            self._front_end.insert(first.prepared, self._T_odom_middle, twist)
+            match, twist = self._match(view, seconds)
+        self._T_odom_keyframe = self._T_odom_middle @ se3_exp(-first.middle * twist)
+        return match, twist
 
     def _match(self, view: CloudView, seconds: float) -> tuple[SweepMatch, Array]:
         """Lay a sweep down where it should be, and again with the motion that this gives."""
@@ -207,6 +215,7 @@ class CloudTracker:
         """Take a match as found; the second sweep becomes a keyframe, as the first has no cloud."""
         T_step = se3_inverse(self._T_odom_middle) @ match.T_map_body
         step = self._step_covariance(match, seconds)
+        self._unsteady2 += LEARNING * ((twist - self._twist) ** 2 - self._unsteady2)
         Ad = se3_adjoint(se3_inverse(T_step))
         self._drift = Ad @ self._drift @ Ad.T + self._config.renewal * step
         self._step = step
@@ -219,7 +228,9 @@ class CloudTracker:
             self._hang_anew()
         view.clock.lap("insert")
         T_keyframe_body = se3_inverse(self._T_odom_keyframe) @ self._T_odom_body
-        covariance = self._drift + step
+        # By how much a motion that is not constant errs, ½ a (Δt/2)², here and at the keyframe.
+        shaken = 2.0 * np.diag(self._unsteady2) * (seconds / 8.0) ** 2
+        covariance = self._drift + step + shaken
         placed = Placed(view.frame.stamp_ns, self._keyframe, T_keyframe_body, covariance)
         status = Status.RECOVERED if self._lost else Status.TRACKING
         self._lost = 0
