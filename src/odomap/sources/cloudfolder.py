@@ -37,9 +37,10 @@ from odomap.sources.pointfields import OPTIONS, recognised
 from odomap.sources.recording import check_truth
 from odomap.sources.source import Skipped, UnusableFrame
 from odomap.sources.survey import FAR_M, NEAR_M, mounted_sweeps, sample, survey
+from odomap.sources.sweepfolders import cloud_folder, is_cloud
 from odomap.sources.sweeplog import SweepLog, usual_rate
 
-__all__ = ["CloudSource", "cloud_folder", "is_cloud"]
+__all__ = ["CloudSource"]
 
 READERS: Mapping[str, Callable[[Path], PointTable]] = MappingProxyType(
     {
@@ -52,19 +53,6 @@ READERS: Mapping[str, Callable[[Path], PointTable]] = MappingProxyType(
 )
 TIMES = ("times.txt", "timestamps.txt")
 RATE_HZ = 10.0
-
-
-def is_cloud(path: Path) -> bool:
-    """Tell whether a file is a cloud, by its name."""
-    return path.suffix.lower() in READERS and not path.name.startswith(".")
-
-
-def cloud_folder(path: Path) -> Path | None:
-    """Return the folder of the clouds of a recording: it, or the only one in it that holds any."""
-    if any(is_cloud(file) for file in path.iterdir() if file.is_file()):
-        return path
-    inside = [p for p in sorted(path.iterdir()) if p.is_dir() and any(map(is_cloud, p.iterdir()))]
-    return inside[0] if len(inside) == 1 else None
 
 
 class CloudSource(SweepLog):

@@ -16,7 +16,7 @@ Recognised by what a folder holds, not by its name:
     live camera       a name "camera:0", "camera:0?width=640&height=480"
     simulated world   world.yaml (`odomap_world: 1`), or a name "sim:room?seed=3&frames=100"
 
-Laser logs and bags take options behind a '?': "run.bag?scan=/front/scan" (see `carmen`, `bag`).
+Logs, bags and sweeps take options behind a '?': "run.bag?scan=/front/scan" (see the sources).
 
 A path that leads nowhere is answered with what stands nearest to it.
 """
@@ -29,7 +29,6 @@ from odomap.sources.bagfile import is_bag
 from odomap.sources.calibration import load_rig, rig_beside
 from odomap.sources.camera import PREFIX, CameraSource
 from odomap.sources.carmen import MESSAGES, CarmenSource
-from odomap.sources.cloudfolder import CloudSource, cloud_folder, is_cloud
 from odomap.sources.euroc import EurocSource, is_euroc
 from odomap.sources.folder import FolderSource, image_folders, is_folder
 from odomap.sources.kitti import KittiSource, is_kitti
@@ -38,9 +37,8 @@ from odomap.sources.options import check_options, split_options
 from odomap.sources.packets import is_pcap
 from odomap.sources.plainlog import WORDS, PlainLogSource
 from odomap.sources.source import Source
+from odomap.sources.sweepfolders import cloud_folder, is_cloud, is_velodyne
 from odomap.sources.tum import TumSource, is_tum
-from odomap.sources.velodyne import VelodyneSource, is_velodyne
-from odomap.sources.velodynepcap import PcapSource
 from odomap.sources.video import VideoSource, is_video
 
 __all__ = ["SUPPORTED", "open"]
@@ -94,10 +92,8 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
         return _bag(file, rig, options)
     if is_video(file) or file.suffix.lower() in (".yaml", ".yml"):
         return None
-    if is_pcap(file):
-        return PcapSource(file, _beside(file, rig), options)
-    if is_cloud(file):
-        return CloudSource(file, _beside(file, rig), options)
+    if is_pcap(file) or is_cloud(file):
+        return _sweeps(file, _beside(file, rig), options)
     words = set(beginnings(file))
     for kinds, kind in ((MESSAGES, CarmenSource), (WORDS, PlainLogSource)):
         if words & kinds:
@@ -111,6 +107,24 @@ def _log(file: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> S
 
 def _beside(file: Path, rig: Rig | str | Path | None) -> Rig | None:
     return rig_beside([file.with_name("rig.yaml")]) if rig is None else load_rig(rig)
+
+
+def _sweeps(path: Path, rig: Rig | None, options: dict[str, str]) -> Source:
+    """Return the source of a 3D LiDAR's files; its kernels are imported for nobody else."""
+    source: Source
+    if path.is_file() and is_pcap(path):
+        from odomap.sources.velodynepcap import PcapSource
+
+        source = PcapSource(path, rig, options)
+    elif path.is_dir() and is_velodyne(path):
+        from odomap.sources.velodyne import VelodyneSource
+
+        source = VelodyneSource(path, rig, options)
+    else:
+        from odomap.sources.cloudfolder import CloudSource
+
+        source = CloudSource(path, rig, options)
+    return source
 
 
 def _bag(path: Path, rig: Rig | str | Path | None, options: dict[str, str]) -> Source:
@@ -131,7 +145,7 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
     if not root.exists():
         raise InputError(_missing(root))
     if root.is_dir() and not is_kitti(root) and is_velodyne(root):
-        return VelodyneSource(root, _rig(root, rig, calibrated=False), options)
+        return _sweeps(root, _rig(root, rig, calibrated=False), options)
     if options and not is_bag(root) and not _holds_clouds(root):
         check_options(root, options, ())
     if root.is_file():
@@ -153,7 +167,7 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
         return _bag(root, rig, options)
     calibration = given or rig_beside([root / "rig.yaml"])
     if _holds_clouds(root):
-        return CloudSource(root, calibration, options)
+        return _sweeps(root, calibration, options)
     outside = next((p for p in list(root.resolve().parents)[:3] if _is_recording(p)), None)
     if outside is not None and calibration is None:
         raise InputError(f"{root}: is a part of a recording: open {outside}")

@@ -43,13 +43,13 @@ from odomap.sources.oxts import epoch_text, read_oxts
 from odomap.sources.recording import check_truth
 from odomap.sources.source import Skipped, UnusableFrame
 from odomap.sources.survey import FAR_M, mounted_sweeps, sample, survey
+from odomap.sources.sweepfolders import is_sweep, velodyne_folder
 from odomap.sources.sweeplog import SweepLog, usual_rate
 
-__all__ = ["VelodyneSource", "is_velodyne", "velodyne_folder"]
+__all__ = ["VelodyneSource"]
 
 Array = NDArray[np.float64]
 
-SUFFIX = ".bin"
 COLUMNS = 4
 ROW_BYTES = 4 * COLUMNS
 RATE_HZ = 10.0
@@ -63,23 +63,6 @@ STEP_M, FEWEST_RINGS, SHARE = 0.1, 10, 0.2
 BEAMS = (60, 66)
 """So many beams may be seen of an HDL-64E."""
 TIMES = ("auto", "azimuth", "off")
-
-
-def velodyne_folder(path: Path) -> Path | None:
-    """Return the folder of the .bin files of a recording, or None if there is none."""
-    for place in (path / "velodyne_points" / "data", path / "data", path / "velodyne", path):
-        if place.is_dir() and any(_is_sweep(file) for file in place.iterdir()):
-            return place
-    return None
-
-
-def is_velodyne(path: Path) -> bool:
-    """Tell whether a folder holds sweeps as KITTI writes them."""
-    return velodyne_folder(path) is not None
-
-
-def _is_sweep(file: Path) -> bool:
-    return file.suffix.lower() == SUFFIX and not file.name.startswith(".")
 
 
 class VelodyneSource(SweepLog):
@@ -111,7 +94,7 @@ class VelodyneSource(SweepLog):
         root = _root(folder)
         notes: list[str] = []
         left_out: list[Skipped] = []
-        names = in_order(f.name for f in folder.iterdir() if _is_sweep(f))
+        names = in_order(f.name for f in folder.iterdir() if is_sweep(f))
         rows, stamps = _stamp(folder, root, names, left_out, notes)
         self._files = [folder / names[row] for row in rows]
         self._stamps = stamps
