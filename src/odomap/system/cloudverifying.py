@@ -12,10 +12,10 @@ The last is what tells: streets fit on streets, but not without walls where the 
 through (`lidar/sightlines`). Roads agree everywhere, cars come and go: what stands up counts, where
 anything does. Registration takes errors for independent, and of thinned clouds they are not, so
 
-    Σ = 9 (I + I₀)⁻¹ + diag(0.03 m/m, 0.005 rad/m)² e²
+    Σ = 12 (I + I₀)⁻¹ + diag(0.04 m/m, 0.007 rad/m)² e²
 
 with e the root mean square distance of the points from the surface, and I₀ that of what nobody
-knows, 1 m and 0.1 rad, along a tunnel: of simulated streets 0.4 (32 beams) to 1.2 (16 beams) of it.
+knows, 1 m and 0.1 rad, along a tunnel. Errors are 0.3 (32 beams) to 1.4 (16 beams) of it, squared.
 
 Cost: 20 ms beside the place.
 
@@ -43,8 +43,8 @@ Array = NDArray[np.float64]
 LOWEST, TALL, FEWEST = 0.05, 2.0, 200
 """Share of the points that may be below the ground, height above it from which a thing stands up,
 metres, and points that there must be of them."""
-INFLATED = 9.0
-FLOOR = np.array([0.03] * 3 + [0.005] * 3)
+INFLATED = 12.0
+FLOOR = np.array([0.04] * 3 + [0.007] * 3)
 UNKNOWN = np.diag([1.0] * 3 + [0.1] * 3) ** 2
 
 
