@@ -33,6 +33,8 @@ Ids = NDArray[np.int32]
 NOTHING, GROUND = -1, -2
 """Whom a beam met that met no shape."""
 DEPTH = 64
+MARGIN_M = 5.0
+"""No mover comes nearer by more within a sweep."""
 BELOW = -1e9
 """Height of the ground where there is none."""
 
@@ -56,50 +58,22 @@ def cast(
         (S, B) distances, whom each met: a row of the shapes, GROUND or NOTHING, and (S, B, 3) the
         normals of the surfaces in the world, towards the LiDAR, NaN where there is none.
     """
-    shapes = solids.at(time)
-    spheres, velocities, first = _bounds(solids, shapes, Ts_world_lidar[0, :3, 3], time, farthest)
+    Ts, velocities = solids.motions(time)
+    spheres = np.column_stack([Ts[:, :3, 3], solids.radii])
+    first = solids.num_still + np.searchsorted(solids.mover, np.arange(len(Ts) + 1))
+    away = np.linalg.norm(Ts[:, :3, 3] - Ts_world_lidar[0, :3, 3], axis=1) - solids.radii
+    near = away < farthest + MARGIN_M
     shape = directions.shape[:2]
     distance, hit = np.empty(shape), np.empty(shape, np.int32)
     normals = np.empty((*shape, 3))
     ground = solids.ground
     _cast_kernel(
-        np.ascontiguousarray(Ts_world_lidar), delays, directions, chances, farthest, shapes,
-        solids.forms, solids.boxes, solids.nodes, solids.num_still, spheres, velocities, first,
+        np.ascontiguousarray(Ts_world_lidar), delays, directions, chances, farthest,
+        solids.placed(Ts), solids.forms, solids.boxes, solids.nodes, solids.num_still,
+        spheres[near], velocities[near], np.column_stack([first[:-1], first[1:]])[near],
         ground.heights, ground.corner, ground.steepest, distance, hit, normals,
     )  # fmt: skip
     return distance, hit, normals
-
-
-def _bounds(
-    solids: Solids, shapes: Array, eye: Array, time: float, farthest: float
-) -> tuple[Array, Array, Index]:
-    """Return the movers within reach: spheres (K, 4), velocities (K, 3), first and last shape."""
-    spheres, velocities, first = [], [], []
-    for k, path in enumerate(solids.movers):
-        motion = path.at(np.array([time]))
-        middle, velocity = motion.Ts_world_body[0, :3, 3], motion.v_world_body[0]
-        rows = solids.num_still + np.searchsorted(solids.mover, [k, k + 1])
-        part = shapes[rows[0] : rows[1]]
-        # Corners c, c + a u, c + b v, c + a u + b v, of which n, u, v know the coordinates.
-        radius = 0.0
-        axes = part[:, [0, 1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 3)
-        for s in (0.0, 1.0):
-            for t in (0.0, 1.0):
-                along = part[:, [3, 7, 11]] + np.column_stack(
-                    [np.zeros(len(part)), s * part[:, 12], t * part[:, 13]]
-                )
-                corners = np.einsum("nij,ni->nj", axes, along)
-                radius = max(radius, float(np.linalg.norm(corners - middle, axis=1).max()))
-        if np.linalg.norm(middle - eye) - radius > farthest + 5.0:
-            continue
-        spheres.append([*middle, radius])
-        velocities.append(velocity)
-        first.append(rows)
-    return (
-        np.array(spheres).reshape(-1, 4),
-        np.array(velocities).reshape(-1, 3),
-        np.array(first, np.int64).reshape(-1, 2),
-    )
 
 
 @kernel

@@ -110,6 +110,7 @@ class Solids:
         nodes: (M, 4) of either child: a node, or -1 - first shape, and then how many.
         num_still: how many stand still.
         mover: (N - num_still,) which mover each of the others belongs to, ascending.
+        radii: (K,) how far each mover reaches from its middle, metres.
         movers: path of each, T_world_mover.
         ground: what all stands on.
     """
@@ -124,6 +125,7 @@ class Solids:
     nodes: Index
     num_still: int
     mover: Index
+    radii: Array
     movers: tuple[Path, ...]
     ground: Ground
 
@@ -132,18 +134,25 @@ class Solids:
 
     def at(self, time: float) -> Array:
         """Return (N, 14) shapes in the world at a time in seconds."""
+        return self.placed(self.motions(time)[0])
+
+    def motions(self, time: float) -> tuple[Array, Array]:
+        """Return T_world_mover (K, 4, 4) and velocities (K, 3) of the movers at a time."""
+        now = np.array([time])
+        found = [path.at(now) for path in self.movers]
+        Ts = np.array([motion.Ts_world_body[0] for motion in found]).reshape(-1, 4, 4)
+        return Ts, np.array([motion.v_world_body[0] for motion in found]).reshape(-1, 3)
+
+    def placed(self, Ts_world_mover: Array) -> Array:
+        """Return (N, 14) shapes in the world, with the movers at (K, 4, 4)."""
         if not self.movers:
             return self.shapes
         shapes = self.shapes.copy()
-        Ts = [path.at(np.array([time])).Ts_world_body[0] for path in self.movers]
-        for k, T in enumerate(Ts):
-            rows = self.num_still + np.flatnonzero(self.mover == k)
-            part = shapes[rows]
-            for first in (0, 4, 8):
-                turned = part[:, first : first + 3] @ T[:3, :3].T
-                part[:, first : first + 3] = turned
-                part[:, first + 3] += turned @ T[:3, 3]
-            shapes[rows] = part
+        part, Ts = shapes[self.num_still :], Ts_world_mover[self.mover]
+        for first in (0, 4, 8):
+            turned = np.einsum("nij,nj->ni", Ts[:, :3, :3], part[:, first : first + 3])
+            part[:, first : first + 3] = turned
+            part[:, first + 3] += (turned * Ts[:, :3, 3]).sum(axis=1)
         return shapes
 
 
@@ -261,7 +270,8 @@ class SolidsBuilder:
             shapes, forms.astype(np.int64), kinds,
             np.where(albedos > 0, albedos, usual[kinds]).astype(np.float32),
             things.astype(np.int64), is_ground.astype(np.bool_), boxes, nodes,
-            len(still), mover[moving], tuple(self._paths), self.ground,
+            len(still), mover[moving], _radii(shapes[len(still) :], mover[moving], self._paths),
+            tuple(self._paths), self.ground,
         )  # fmt: skip
 
     def _add(
@@ -274,6 +284,16 @@ class SolidsBuilder:
         self._high.append(high)
         self._facts.append((form, kind, albedo, thing or self.thing(), is_ground))
         self._mover.append(mover)
+
+
+def _radii(shapes: Array, mover: Index, movers: list[Path]) -> Array:
+    """Return how far the rectangles (M, 14) of each mover reach from its origin."""
+    radii = np.zeros(len(movers))
+    for s, t in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        # n, u and v are square to each other: they know how far the corner is along each.
+        far = shapes[:, [3, 7, 11]] + shapes[:, [12, 12, 13]] * [0, s, t]
+        np.maximum.at(radii, mover, np.linalg.norm(far, axis=1))
+    return radii
 
 
 def _paired(tree: BoxTree) -> tuple[Array, Index]:
