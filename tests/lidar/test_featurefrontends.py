@@ -8,7 +8,7 @@ import pytest
 
 from odomap.errors import ConfigError, InputError
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
-from odomap.lidar.featureconfig import FeatureConfig, FeatureMapConfig, LegoConfig, LoamConfig
+from odomap.lidar.featureconfig import CurvatureConfig, FeatureMapConfig, GroundConfig, LoamConfig
 from odomap.lidar.featuremap import AXIS, MEAN, SPREAD, VoxelShapes
 from odomap.lidar.lego import LegoFrontEnd
 from odomap.lidar.loam import LoamFrontEnd
@@ -163,6 +163,19 @@ def test_the_same_sweeps_give_the_same_bytes(make):
     assert follow(front_end, sweeps, dt)[0].tobytes() == first
 
 
+@pytest.mark.parametrize("make", FRONT_ENDS)
+def test_a_sweep_is_laid_onto_points_of_another_map(make):
+    sweeps, Ts, dt = drive("street", 1, 32, frames=6)
+    front_end, twist = make(), true_twist(Ts, dt)
+    for k in range(5):
+        front_end.seed(sweeps[k].points[::3] @ Ts[k][:3, :3].T + Ts[k][:3, 3])
+    match = front_end.match(front_end.prepare(sweeps[5]), Ts[5] @ se3_exp([0.2] + 5 * [0]), twist)
+    off = se3_log(se3_inverse(Ts[5]) @ match.T_map_body)
+    assert match.share > 0.5
+    assert np.linalg.norm(off[:3]) < 0.15  # its sweeps were not deskewed
+    assert np.linalg.norm(off[3:]) < 0.01
+
+
 def test_what_is_far_is_forgotten():
     config = LoamConfig(map=FeatureMapConfig(radius=40.0))
     sweeps, Ts, dt = drive("street", 1, 16, frames=3)
@@ -199,9 +212,9 @@ def test_a_plane_and_an_edge_are_fitted_and_a_bush_is_neither():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: FeatureConfig(baseline=0.0), lambda: FeatureConfig(sharp=1.5),
-        lambda: FeatureMapConfig(radius=-1.0), lambda: FeatureConfig(fewest=0),
-        lambda: LegoConfig(slope=float("nan")),
+        lambda: CurvatureConfig(baseline=0.0), lambda: CurvatureConfig(sharp=1.5),
+        lambda: FeatureMapConfig(radius=-1.0), lambda: CurvatureConfig(fewest=0),
+        lambda: GroundConfig(slope=float("nan")),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(make):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from odomap.lidar.curvature import curvatures
-from odomap.lidar.featureconfig import FeatureConfig
+from odomap.lidar.featureconfig import CurvatureConfig
 from odomap.lidar.featurematching import EDGES, GROUND
 from odomap.lidar.featurepicking import EDGE, FLAT, PLANE, pick
 from odomap.lidar.lego import LegoFrontEnd
@@ -187,7 +187,7 @@ def test_more_of_the_sharpest_are_taken_where_more_are_asked_for():
     lines = scan_lines(sweep, np.eye(4))
     counts = []
     for edges in (1, 2, 6):
-        config = FeatureConfig(edges=edges)
+        config = CurvatureConfig(edges=edges)
         c, reach = curvatures(lines, config)
         marks = pick(lines, c, reach, np.full(len(c), 3, np.uint8), config)
         counts.append(int(np.count_nonzero(marks == EDGE)))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from odomap.geometry.pnp_kernels import cholesky_solve
 from odomap.kernels import kernel
-from odomap.lidar.featureconfig import FeatureConfig
+from odomap.lidar.featureconfig import CurvatureConfig
 from odomap.lidar.scanlines import ScanLines
 
 __all__ = ["CUT", "FAR_MORE", "FRONT", "curvatures", "is_smooth", "warm_up"]
@@ -54,7 +54,7 @@ FRONT, CUT = 1.0, -2.0
 """Curvature of an edge in front of something, and of points too near to a break to have one."""
 
 
-def curvatures(lines: ScanLines, config: FeatureConfig) -> tuple[Array, Index]:
+def curvatures(lines: ScanLines, config: CurvatureConfig) -> tuple[Array, Index]:
     """Return curvatures (N,) and how many neighbours (N,) were looked at on either side.
 
     Curvatures are negative where a point is neither an edge nor in a plane.
@@ -273,5 +273,5 @@ def warm_up() -> None:
     points = np.array([[5.0, 0.01 * n, 0.0] for n in range(12)])
     order, start = np.arange(12), np.array([0, 12])
     lines = ScanLines(points, order, start, True, 0.002)
-    curvatures(lines, FeatureConfig())
-    curvatures(ScanLines(points, order, start, False, 0.002), FeatureConfig())
+    curvatures(lines, CurvatureConfig())
+    curvatures(ScanLines(points, order, start, False, 0.002), CurvatureConfig())

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 
 from odomap.limits import Count, Fraction, NotNegative, Positive, check_limits
 
-__all__ = ["FeatureConfig", "FeatureMapConfig", "LegoConfig", "LoamConfig"]
+__all__ = ["CurvatureConfig", "FeatureMapConfig", "GroundConfig", "LegoConfig", "LoamConfig"]
 
 
 @dataclass(frozen=True)
-class FeatureConfig:
+class CurvatureConfig:
     """What of a scan line is an edge, and what a plane."""
 
     baseline: Positive = 0.25
@@ -75,31 +75,35 @@ class FeatureMapConfig:
 
 
 @dataclass(frozen=True)
+class GroundConfig:
+    """What is ground, and what stands on it."""
+
+    slope: Positive = 0.18
+    """Most that the ground may slope from one ring to the next, radians."""
+    same: Positive = 0.17
+    """Angle of the beam with the line between neighbours, from which on they are of one thing."""
+    smallest: Count = 30
+    """Points of a thing that is kept."""
+    narrow: Count = 5
+    """Points of one that is kept if it is seen by three rings or more."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True)
 class LoamConfig:
     """LOAM's edges and planes."""
 
-    features: FeatureConfig = field(default_factory=FeatureConfig)
+    curvature: CurvatureConfig = field(default_factory=CurvatureConfig)
     """What is an edge or a plane."""
     map: FeatureMapConfig = field(default_factory=FeatureMapConfig)
     """What they are laid onto."""
 
 
 @dataclass(frozen=True)
-class LegoConfig:
-    """LeGO-LOAM's ground, clusters, edges and planes."""
+class LegoConfig(LoamConfig):
+    """LeGO-LOAM's ground, things, edges and planes."""
 
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    """What is an edge or a plane."""
-    map: FeatureMapConfig = field(default_factory=FeatureMapConfig)
-    """What they are laid onto."""
-    slope: Positive = 0.18
-    """Most that the ground may slope from one ring to the next, radians."""
-    same: Positive = 0.17
-    """Angle of the beam with the line between neighbours, from which on they are of one thing."""
-    smallest: Count = 30
-    """Points of a cluster that is kept."""
-    narrow: Count = 5
-    """Points of one that is kept if it is seen by three rings or more."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    """What is ground, and what stands on it."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from odomap.kernels import kernel
 from odomap.lidar.curvature import CUT, FAR_MORE, FRONT, is_smooth
-from odomap.lidar.featureconfig import FeatureConfig
+from odomap.lidar.featureconfig import CurvatureConfig
 from odomap.lidar.scanlines import ScanLines
 
 __all__ = ["EDGE", "FLAT", "PLANE", "pick", "warm_up"]
@@ -35,7 +35,7 @@ SIDE = 4
 """Points on either side of a bend between which the line must be smooth."""
 
 
-def pick(lines: ScanLines, c: Array, reach: Index, may: Marks, config: FeatureConfig) -> Marks:
+def pick(lines: ScanLines, c: Array, reach: Index, may: Marks, config: CurvatureConfig) -> Marks:
     """Mark edges and planes.
 
     Args:
@@ -162,4 +162,4 @@ def warm_up() -> None:
     points = np.array([[5.0, 0.01 * n, 0.0] for n in range(12)])
     lines = ScanLines(points, np.arange(12), np.array([0, 12]), True, 0.002)
     c, reach = np.linspace(0.0, 1.0, 12), np.full(12, 2)
-    pick(lines, c, reach, np.full(12, 3, np.uint8), FeatureConfig())
+    pick(lines, c, reach, np.full(12, 3, np.uint8), CurvatureConfig())

@@ -165,6 +165,11 @@ class LocalFeatures:
             self.edges.forget(self._centre, self._config.radius)
             self.planes.forget(self._centre, self._config.radius)
 
+    def seed(self, points: Array) -> None:
+        """Add points (N, 3) of another map, of which nobody says what they are, to the planes."""
+        self.planes.insert(np.ascontiguousarray(points))
+        self._age, self._first = max(self._age, YOUNG + 1), None
+
     def _lay_first(self, twist: Array) -> None:
         """Add the first sweep again, as long as it is alone, by how the body moves.
 

@@ -59,12 +59,13 @@ class LegoFrontEnd:
         config = self._config
         lines = scan_lines(sweep, self._T_body_lidar)
         image = range_image(lines, self._T_body_lidar[:3, :3])
-        ground = find_ground(image, config.slope)
-        things = find_clusters(image, ground, config.same, config.smallest, config.narrow)
+        rules = config.ground
+        ground = find_ground(image, rules.slope)
+        things = find_clusters(image, ground, rules.same, rules.smallest, rules.narrow)
         is_ground, is_thing = image.spread(ground), image.spread(things >= 0)
         may = np.where(is_thing, 3, np.where(is_ground, 1, 0)).astype(np.uint8)
-        c, reach = curvatures(lines, config.features)
-        marks = pick(lines, c, reach, may, config.features)
+        c, reach = curvatures(lines, config.curvature)
+        marks = pick(lines, c, reach, may, config.curvature)
         return features_of(sweep, lines, marks, is_ground)
 
     def match(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> SweepMatch:
@@ -81,6 +82,10 @@ class LegoFrontEnd:
     def insert(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> None:
         """Add a sweep to the map, and forget what is far from it."""
         self._map.insert(prepared, T_map_body, twist)
+
+    def seed(self, points: Array) -> None:
+        """Add points (N, 3) of another map, in the frame of this one."""
+        self._map.seed(points)
 
     def clear(self) -> None:
         """Forget the map."""

@@ -50,9 +50,9 @@ class LoamFrontEnd:
     def prepare(self, sweep: SweepPoints) -> FeatureSweep:
         """Find edges and planes."""
         lines = scan_lines(sweep, self._T_body_lidar)
-        c, reach = curvatures(lines, self._config.features)
+        c, reach = curvatures(lines, self._config.curvature)
         may = np.full(len(c), 3, np.uint8)
-        marks = pick(lines, c, reach, may, self._config.features)
+        marks = pick(lines, c, reach, may, self._config.curvature)
         return features_of(sweep, lines, marks, np.zeros(len(c), np.bool_))
 
     def match(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> SweepMatch:
@@ -67,6 +67,10 @@ class LoamFrontEnd:
     def insert(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> None:
         """Add a sweep to the map, and forget what is far from it."""
         self._map.insert(prepared, T_map_body, twist)
+
+    def seed(self, points: Array) -> None:
+        """Add points (N, 3) of another map, in the frame of this one."""
+        self._map.seed(points)
 
     def clear(self) -> None:
         """Forget the map."""

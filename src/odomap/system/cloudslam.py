@@ -12,6 +12,7 @@ Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8
 from typing import Any
 
 from odomap.errors import CalibrationError, ConfigError
+from odomap.lidar.featureconfig import LegoConfig, LoamConfig
 from odomap.lidar.frontend import FrontEnd
 from odomap.maps.map import Map
 from odomap.sensors.rig import LidarMount, Rig
@@ -77,9 +78,23 @@ class CloudSlam(System):
         return CloudCloser(self.map, self._mount.T_body_lidar.matrix, self._config.cloud_closing)
 
     def _front_end(self) -> FrontEnd[Any]:
+        """Return what lays sweeps onto each other; only what is chosen is imported and compiled."""
+        config, name = self._config, self._config.cloud_tracking.front_end
+        rules, T_body_lidar = (
+            (config.curvature, config.feature_map),
+            self._mount.T_body_lidar.matrix,
+        )
+        if name == "loam":
+            from odomap.lidar.loam import LoamFrontEnd
+
+            return LoamFrontEnd(LoamConfig(*rules), T_body_lidar)
+        if name == "lego":
+            from odomap.lidar.lego import LegoFrontEnd
+
+            return LegoFrontEnd(LegoConfig(*rules, config.ground), T_body_lidar)
         from odomap.lidar.planefrontend import PlaneFrontEnd
 
-        return PlaneFrontEnd(self._config.points)
+        return PlaneFrontEnd(config.points)
 
     @property
     def _path(self) -> Path:

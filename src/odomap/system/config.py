@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleConfig
 from odomap.errors import CalibrationError, ConfigError, nearest_name
 from odomap.lidar.cloudconfig import PointsConfig
+from odomap.lidar.featureconfig import CurvatureConfig, FeatureMapConfig, GroundConfig
 from odomap.lidar.scanconfig import ScanConfig
 from odomap.sensors.rig import Rig
 from odomap.system.adjusting import AdjustingConfig
@@ -128,6 +129,12 @@ class Config:
     """When submaps go that show nothing new."""
     points: PointsConfig = field(default_factory=PointsConfig)
     """How sweeps are laid onto surfaces."""
+    curvature: CurvatureConfig = field(default_factory=CurvatureConfig)
+    """What of a sweep is an edge, and what a plane, for the front-ends "loam" and "lego"."""
+    feature_map: FeatureMapConfig = field(default_factory=FeatureMapConfig)
+    """What those are laid onto."""
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    """What is ground for the front-end "lego", and what stands on it."""
     cloud_tracking: CloudTrackingConfig = field(default_factory=CloudTrackingConfig)
     """How sweeps are placed and when one becomes a keyframe."""
     cloud_recognition: CloudRecognitionConfig = field(default_factory=CloudRecognitionConfig)
