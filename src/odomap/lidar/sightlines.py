@@ -35,7 +35,7 @@ Single = NDArray[np.float32]
 
 PIXEL = np.radians(2.0)
 """Width of a pixel."""
-MARGIN, SLOPE = 0.8, 0.08
+MARGIN, SLOPE = 0.4, 0.08
 """Least margin, metres, and what is added of the range: twice a pixel, seen at a slant."""
 SHARE_FAR = 60.0
 """Points beyond say nothing: they are few, and far apart; metres."""

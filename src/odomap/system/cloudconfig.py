@@ -108,7 +108,9 @@ class CloudClosingConfig:
     """Share of a cloud that must meet what is known."""
     agree: Fraction = 0.05
     """Share of what stands up in one sweep that the other must have seen, too."""
-    against: Fraction = 0.05
+    misfit: Positive = 0.3
+    """Largest root mean square distance of its points from the surface there, in voxels."""
+    against: Fraction = 0.08
     """Share of that which the other may have looked through, relative to both."""
     solve_every: Count = 8
     """Keyframes after which the path is solved anew if there are new loops; in large maps more."""
@@ -135,7 +137,9 @@ class CloudRecognitionConfig:
     """Places that it is laid onto."""
     overlap: Fraction = 0.7
     """Share of it that must meet what is known."""
-    against: Fraction = 0.04
+    misfit: Positive = 0.26
+    """Largest root mean square distance of its points from the surface there, in voxels."""
+    against: Fraction = 0.05
     """Share of what stands up in one that the other may have looked through."""
     sigma: Positive = 0.5
     """Largest standard deviation of where it is, metres."""

@@ -80,6 +80,7 @@ class CloudFinder:
             alike=config.alike,
             most=config.most,
             overlap=config.overlap,
+            misfit=config.misfit,
             against=config.against,
         )
         self._map, self._T_body_lidar, self._config = map, np.array(T_body_lidar), config

@@ -4,7 +4,7 @@ A candidate is a guess of where one LiDAR was in the frame of another. The cloud
 place there by GICP, and believed if all of this holds:
 
     it comes to rest                                    else the guess was too far off
-    enough of it meets what is known                    else it is somewhere else
+    enough of it meets what is known, and closely       else it is somewhere else
     each saw what stands up in the other                else nothing speaks for it
     and neither looked through it                       else the places only look the same
 
@@ -142,6 +142,8 @@ def _reason(
         return found.reason
     if overlap < config.overlap:
         return f"{overlap:.0%} of {found.num_points} points meet what is known there"
+    if found.error > config.misfit * config.voxel:
+        return f"its points are {found.error:.2f} m off the surface there, in the mean"
     agree, doubt = min(s.agree for s in seen), max(s.doubt for s in seen)
     if agree < config.agree:
         return f"{agree:.0%} of what stands there was seen by both"
