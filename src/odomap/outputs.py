@@ -9,11 +9,14 @@ which are there.
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
+
 from odomap.errors import OutputError
-from odomap.files.atomic import make_folder, write_text
+from odomap.files.atomic import make_folder, write_bytes, write_text
 from odomap.files.loops import LOOPS_FILE, LoopLog, write_loops
 from odomap.files.mapfile import save_map
 from odomap.files.trajectories import write_tum
@@ -25,6 +28,7 @@ from odomap.settings import config_to_yaml
 from odomap.version import __version__
 
 if TYPE_CHECKING:
+    from odomap.maps.map import Map
     from odomap.sources.source import Source
     from odomap.system.config import Config
     from odomap.system.system import Result
@@ -58,9 +62,13 @@ REPORTED = (
 
 GRID_FILE = "grid.yaml"
 """Name of the grid in the folder of a run; its pictures are beside it."""
-OF_THE_MAP = ("keyframes.tum", "map.odomap", GRID_FILE)
+CLOUD_FILE = "cloud.ply"
+"""Name of the cloud in the folder of a run; its picture is beside it."""
+OF_THE_MAP = ("keyframes.tum", "map.odomap", GRID_FILE, CLOUD_FILE)
 """What is not written where frames are only placed in a map."""
 
+MOST_CELLS = 2000
+"""Cells of a grid along the way of a LiDAR: streets need no finer ones."""
 FLUSH_EVERY = 25
 """Frames after which the live path is handed to the operating system."""
 
@@ -87,7 +95,7 @@ class Outputs:
         self._config = config_to_yaml(config, {"odomap": __version__} | dict(head))
         self._data = str(head.get("data", ""))
         self._settings, self._map = map_settings(config), str(head.get("map", ""))
-        self._scan, self._picture = config.scan, b""
+        self._scan, self._picture, self._cloud_picture = config.scan, b"", b""
         self._is_mapping = bool(head.get("is_mapping", True))
         self._part = self.folder / "trajectory_live.tum.part"
         self._live: TextIO | None = None
@@ -135,6 +143,7 @@ class Outputs:
             ("keyframes.tum", lambda: write_tum(self._at("keyframes.tum"), result.keyframes)),
             ("map.odomap", lambda: self._write_map(source, result, metrics)),
             *self._grid(source, result),
+            *self._cloud(source, result),
             *self._loops(source, result, logbook),
             ("config.yaml", lambda: write_text(self._at("config.yaml"), self._config)),
             ("metrics.json", lambda: write_text(self._at("metrics.json"), as_json(metrics))),
@@ -180,8 +189,8 @@ class Outputs:
         return [(LOOPS_FILE, lambda: write_loops(file, loops))]
 
     def _grid(self, source: "Source", result: "Result") -> list[tuple[str, Callable[[], object]]]:
-        """Return the job of writing a grid, where a laser made the map."""
-        if self._settings["sensors"] != "lidar2d" or not result.map.num_keyframes:
+        """Return the job of writing a grid, where a laser or a LiDAR made the map."""
+        if self._settings["sensors"] not in ("lidar2d", "lidar") or not _has_seen(result.map):
             return []
         return [(GRID_FILE, lambda: self._write_grid(source, result))]
 
@@ -189,9 +198,30 @@ class Outputs:
         from odomap.maps.occupancy import GridConfig, grid_of_map
         from odomap.views.gridpicture import write_grid
 
-        made = grid_of_map(result.map, source.rig, GridConfig(scan=self._scan))
+        config = GridConfig(scan=self._scan)
+        if self._settings["sensors"] == "lidar":
+            places = result.map.Ts_world_body(result.map.keyframe_ids)[:, :3, 3]
+            wide = float(np.ptp(places, axis=0).max())
+            config = replace(config, resolution=max(config.resolution, wide / MOST_CELLS))
+        made = grid_of_map(result.map, source.rig, config)
         *_, picture = write_grid(self._at(GRID_FILE), made)
         self._picture = picture.read_bytes()
+
+    def _cloud(self, source: "Source", result: "Result") -> list[tuple[str, Callable[[], object]]]:
+        """Return the job of writing a cloud, where a LiDAR made the map."""
+        if self._settings["sensors"] != "lidar" or not _has_seen(result.map):
+            return []
+        return [(CLOUD_FILE, lambda: self._write_cloud(source, result))]
+
+    def _write_cloud(self, source: "Source", result: "Result") -> None:
+        from odomap.files.cloudfiles import write_cloud
+        from odomap.maps.cloudmap import cloud_of_map
+        from odomap.views.cloudpicture import cloud_png
+
+        made = cloud_of_map(result.map, source.rig)
+        write_cloud(self._at(CLOUD_FILE), made.columns())
+        self._cloud_picture = cloud_png(made)
+        write_bytes(self._at(CLOUD_FILE).with_suffix(".png"), self._cloud_picture)
 
     def _write_map(self, source: "Source", result: "Result", metrics: dict[str, Any]) -> None:
         file = self._at("map.odomap")
@@ -207,8 +237,6 @@ class Outputs:
         warnings: list[str],
     ) -> "Report":
         """Gather what the report shows."""
-        import numpy as np
-
         from odomap.geometry.pose import Sim3
         from odomap.views.covisibility import MapView
         from odomap.views.record import Report, Sample, Scale
@@ -247,6 +275,7 @@ class Outputs:
             beside_ms=metrics.get("beside_ms", {}),
             loops=self._loop_view(source, result, logbook, scale),
             grid_png=self._picture,
+            cloud_png=self._cloud_picture,
         )
 
     def _loop_view(
@@ -334,3 +363,9 @@ def rig_text(source: "Source") -> str:
         lines.append(f"imu: {source.rig.imu.rate_hz:g} Hz")
     lines += [f"lidar {mount.name}: {mount.rate_hz:g} Hz" for mount in source.rig.lidars]
     return "\n".join(lines)
+
+
+def _has_seen(map: "Map") -> bool:
+    """Say whether keyframes of a map have a scan or a cloud."""
+    keyframes = (map.keyframe(k) for k in map.keyframe_ids.tolist())
+    return any(keyframe.scan is not None or keyframe.cloud is not None for keyframe in keyframes)

@@ -29,7 +29,7 @@ KINDS = {
     "rgbd": "a camera with depth",
     "mono": "one camera",
     "lidar2d": "a 2D laser",
-    "lidar3d": "a 3D LiDAR",
+    "lidar": "a 3D LiDAR",
 }
 """What `tracking.sensors` says, in words."""
 
@@ -118,7 +118,7 @@ class SavedMap:
         """Make sure that something could be recognised in the map."""
         from odomap.system.recognition import describes_places
 
-        of_lidars = {"lidar2d": "scan", "lidar3d": "cloud"}
+        of_lidars = {"lidar2d": "scan", "lidar": "cloud"}
         if sensors in of_lidars:
             kept = of_lidars[sensors]
             keyframes = (self.map.keyframe(k) for k in self.map.keyframe_ids)
@@ -185,7 +185,7 @@ def rig_differences(there: Rig, here: Rig, sensors: str) -> Iterator[str]:
         here: the rig of a recording.
         sensors: stereo, rgbd or mono.
     """
-    if sensors == "lidar3d":
+    if sensors == "lidar":
         return  # any LiDAR sees the same surfaces
     if sensors == "lidar2d":
         yield from _lasers(there, here)

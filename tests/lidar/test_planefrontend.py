@@ -6,9 +6,10 @@ import pytest
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.lidar.cloudconfig import PointsConfig
 from odomap.lidar.deskew import deskew
-from odomap.lidar.planefrontend import PlaneFrontEnd, first_in_voxels, suitable_voxel
+from odomap.lidar.planefrontend import PlaneFrontEnd, suitable_voxel
 from odomap.lidar.planemap import COARSER, PlaneMap
 from odomap.lidar.sweeps import SweepPoints
+from odomap.lidar.voxels import first_in_voxels
 
 SIDES = np.array([12.0, 8.0, 3.0])
 

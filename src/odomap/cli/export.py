@@ -22,8 +22,8 @@ class Export:
 
     Cloud and mesh are re-made from the run's keyframes, for which its recording is opened again.
     Without options both are written into the run's folder. --points, --trajectory, --graph and
-    --colmap take what the map holds, and need no recording. --grid makes an occupancy grid of the
-    map's scans or clouds, or of the recording's depth.
+    --colmap take what the map holds, and need no recording, nor does the cloud of a LiDAR. --grid
+    makes an occupancy grid of the map's scans or clouds, or of the recording's depth.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|MAP")]
@@ -47,11 +47,11 @@ class Export:
     up: Literal["gravity", "body"] = "gravity"
     """What heights are counted along: body for what drives on wheels, up ramps, too."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """PLY file for the coloured points."""
+    """File for the points: PLY, coloured; of a LiDAR PLY or PCD, with intensities."""
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """PLY file for the triangles; a picture of them is drawn beside it."""
     voxel: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Side of a voxel; default by the scene: 0.02 in a room, more in a street."""
+    """Side of a voxel; default by the scene: 0.02 in a room, more in a street; 0.2 of a LiDAR."""
     max_depth: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Depths beyond are not used; default as far as their noise is below two voxels."""
     data: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
@@ -75,6 +75,11 @@ class Export:
             self._write_map(of_map)
         if self.grid is not None:
             self._make_grid(self.grid)
+        asks_for_surface = self.cloud is not None or self.mesh is not None
+        if asks_for_surface or not (is_of_map or self.grid is not None):
+            saved = self._of_lidar()
+            if saved is not None:
+                return self._make_cloud(saved)
         if self.cloud is not None or self.mesh is not None:
             return self._make_surface()
         if is_of_map or self.grid is not None:
@@ -85,6 +90,48 @@ class Export:
                 "or --colmap FOLDER (a cloud and a mesh are made of a run's folder)"
             )
         return self._make_surface()
+
+    def _of_lidar(self) -> "SavedMap | None":
+        """Return the map if a 3D LiDAR made it: its keyframes hold the cloud."""
+        from odomap.savedmap import FILE, SavedMap
+
+        file = self.run / FILE if self.run.is_dir() else self.run
+        if not file.is_file():
+            return None
+        saved = SavedMap.load(file)
+        return saved if saved.sensors == "lidar" else None
+
+    def _make_cloud(self, saved: "SavedMap") -> int:
+        from odomap.files.atomic import make_folder
+        from odomap.files.cloudfiles import check_ending, write_cloud
+        from odomap.files.rig import read_rig
+        from odomap.maps.cloudmap import VOXEL, cloud_of_map
+
+        if self.mesh is not None:
+            raise InputError("--mesh: a LiDAR's map has points and no surface: give --cloud FILE")
+        rig = saved.rig if self.rig is None else read_rig(self.rig)
+        if rig is None:
+            raise InputError(f"{saved.name}: does not say where its LiDAR was: give --rig")
+        folder = self.run if self.run.is_dir() else self.run.parent
+        file = folder / "cloud.ply" if self.cloud is None else self.cloud
+        check_ending(file)
+        made = cloud_of_map(saved.map, rig, VOXEL if self.voxel is None else self.voxel)
+        make_folder(file.parent)
+        write_cloud(file, made.columns())
+        written = [file]
+        if self.picture:
+            from odomap.files.atomic import write_bytes
+            from odomap.views.cloudpicture import cloud_png
+
+            written.append(file.with_suffix(".png"))
+            write_bytes(written[-1], cloud_png(made))
+        for note in made.notes:
+            print(f"odomap: {note}", file=sys.stderr)
+        print(f"{'keyframes':<16} {len(made.path)}")
+        print(f"{'points':<16} {len(made.points)}")
+        for each in written:
+            print(f"{'wrote':<16} {each}")
+        return 0
 
     def _make_grid(self, file: Path) -> None:
         from odomap.gridmap import export_grid

@@ -18,16 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_inverse, se3_log
-from odomap.kernels import kernel
 from odomap.lidar.cloudconfig import PointsConfig
 from odomap.lidar.deskew import deskew
 from odomap.lidar.frontend import SweepMatch
 from odomap.lidar.planemap import PlaneMap
 from odomap.lidar.planematching import match_planes
 from odomap.lidar.sweeps import SweepPoints
-from odomap.lidar.voxels import FURTHEST, key_of
+from odomap.lidar.voxels import first_in_voxels
 
-__all__ = ["PlaneFrontEnd", "ThinSweep", "first_in_voxels"]
+__all__ = ["PlaneFrontEnd", "ThinSweep"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -112,39 +111,3 @@ def suitable_voxel(points: Array, config: PointsConfig) -> float:
     """Return a voxel for a place: a share of how far half of what is seen is away."""
     away = float(np.median(np.linalg.norm(points, axis=1)))
     return float(np.clip(config.voxel_share * away, config.least_voxel, config.most_voxel))
-
-
-def first_in_voxels(points: Array, size: float) -> Index:
-    """Return the rows of the first point in each voxel, in order."""
-    slots = 1 << max(int(2 * len(points)).bit_length(), 4)
-    rows = np.empty(len(points), np.int64)
-    count = _first_kernel(points, size, np.full(slots, -1, np.int64), rows)
-    return rows[:count]
-
-
-@kernel
-def _first_kernel(points: Array, size: float, seen: Index, rows: Index) -> int:
-    """rows ← the first point of each voxel; those that are too far to be numbered are left out."""
-    inverse, mask, count = 1.0 / size, seen.shape[0] - 1, 0
-    last = -1
-    for n in range(points.shape[0]):
-        x, y, z = points[n, 0] * inverse, points[n, 1] * inverse, points[n, 2] * inverse
-        if not max(abs(x), abs(y), abs(z)) < FURTHEST - 1:
-            continue
-        key = key_of(int(np.floor(x)), int(np.floor(y)), int(np.floor(z)))
-        if key == last:
-            continue
-        last = key
-        at = ((int(key) * 0x1E3779B97F4A7C15) >> 36) & mask
-        while seen[at] != key and seen[at] >= 0:
-            at = (at + 1) & mask
-        if seen[at] < 0:
-            seen[at] = key
-            rows[count] = n
-            count += 1
-    return count
-
-
-def warm_up() -> None:
-    """Compile the kernels of this file."""
-    first_in_voxels(np.ones((2, 3)), 1.0)

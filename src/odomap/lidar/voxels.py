@@ -32,6 +32,7 @@ __all__ = [
     "Cells",
     "axis_of_key",
     "centred",
+    "first_in_voxels",
     "into_cells",
     "key_of",
     "mean_points",
@@ -215,9 +216,41 @@ def into_cells(points: Array, size: float) -> Cells:
         sums = np.concatenate([sums, np.empty((room - count, 10))])
 
 
+def first_in_voxels(points: Array, size: float) -> Index:
+    """Return the rows of the first point in each voxel, in order."""
+    slots = 1 << max(int(2 * len(points)).bit_length(), 4)
+    rows = np.empty(len(points), np.int64)
+    count = _first_kernel(points, size, np.full(slots, -1, np.int64), rows)
+    return rows[:count]
+
+
+@kernel
+def _first_kernel(points: Array, size: float, seen: Index, rows: Index) -> int:
+    """rows ← the first point of each voxel; those that are too far to be numbered are left out."""
+    inverse, mask, count = 1.0 / size, seen.shape[0] - 1, 0
+    last = -1
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0] * inverse, points[n, 1] * inverse, points[n, 2] * inverse
+        if not max(abs(x), abs(y), abs(z)) < FURTHEST - 1:
+            continue
+        key = key_of(int(np.floor(x)), int(np.floor(y)), int(np.floor(z)))
+        if key == last:
+            continue
+        last = key
+        at = ((int(key) * _MIXER) >> 36) & mask
+        while seen[at] != key and seen[at] >= 0:
+            at = (at + 1) & mask
+        if seen[at] < 0:
+            seen[at] = key
+            rows[count] = n
+            count += 1
+    return count
+
+
 def warm_up() -> None:
     """Compile the kernels of this file."""
     points = centred(np.zeros((1, 3)))[1]
     cells = into_cells(points, 1.0)
     rehash_kernel(cells.keys, 1, new_table(1))
     mean_points(cells.keys, cells.sums, 1.0, points)
+    first_in_voxels(points, 1.0)

@@ -43,7 +43,7 @@ _AS_ONE = np.array([1.0, 1j])
 class TrackingConfig:
     """How frames are placed and when one becomes a keyframe."""
 
-    sensors: Literal["mono", "stereo", "rgbd", "lidar2d", "lidar3d"] = "stereo"
+    sensors: Literal["mono", "stereo", "rgbd", "lidar2d", "lidar"] = "stereo"
     """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image;
     lidar2d: a laser, which no other section of cameras is of use to."""
     association: Literal["features", "flow"] = "features"

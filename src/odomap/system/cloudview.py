@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from odomap.geometry.lie import se3_inverse
 from odomap.lidar.deskew import deskew
 from odomap.lidar.frontend import FrontEnd
-from odomap.lidar.planefrontend import first_in_voxels
 from odomap.lidar.sweeps import SweepPoints, points_of
+from odomap.lidar.voxels import first_in_voxels
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import LidarMount
 from odomap.system.cloudconfig import CloudTrackingConfig

@@ -66,7 +66,7 @@ __all__ = [
 
 
 LASER: Final = "lidar2d"
-LIDAR: Final = "lidar3d"
+LIDAR: Final = "lidar"
 """What `tracking.sensors` says of a 2D laser and of a 3D LiDAR, to which sections of cameras are of
 no use."""
 NO_LOOPS = ClosingConfig(enabled=False)

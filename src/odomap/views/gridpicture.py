@@ -22,7 +22,16 @@ from odomap.views.style import PALETTE
 if TYPE_CHECKING:
     from odomap.maps.occupancy import GridMap
 
-__all__ = ["grid_picture", "grid_png", "write_grid"]
+__all__ = [
+    "FOOT_PX",
+    "LONGEST_PX",
+    "MARGIN_PX",
+    "draw_path",
+    "draw_scale",
+    "grid_picture",
+    "grid_png",
+    "write_grid",
+]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -64,8 +73,8 @@ def grid_picture(grid: OccupancyGrid, path: ArrayLike | None = None) -> Image:
     top = known.origin[1] + len(grey) * px / metre_px
     if path is not None and len(points := np.reshape(np.asarray(path, float), (-1, 2))):
         offset = (points - (known.origin[0], top)) * (metre_px, -metre_px)
-        _draw_path(picture, offset + MARGIN_PX - 0.5)
-    _draw_scale(picture, metre_px)
+        draw_path(picture, offset + MARGIN_PX - 0.5)
+    draw_scale(picture, metre_px)
     return picture
 
 
@@ -124,7 +133,8 @@ def _rgb(name: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _draw_path(picture: Image, pixels: Array) -> None:
+def draw_path(picture: Image, pixels: Array) -> None:
+    """Draw a path (K, 2), in pixels, from a ring to a square."""
     import cv2
 
     far = np.clip(pixels, -(2.0**20), 2.0**20)
@@ -136,7 +146,8 @@ def _draw_path(picture: Image, pixels: Array) -> None:
     cv2.rectangle(picture, (u - 5, v - 5), (u + 5, v + 5), _rgb("lost"), 2, cv2.LINE_AA)
 
 
-def _draw_scale(picture: Image, metre_px: float) -> None:
+def draw_scale(picture: Image, metre_px: float) -> None:
+    """Draw a scale at the foot of a picture, metre_px pixels being a metre."""
     import cv2
 
     height, width = picture.shape[:2]

@@ -15,7 +15,10 @@ __all__ = ["map_section"]
 
 def map_section(report: Report) -> str:
     """Return the section as HTML; empty where a run tells nothing about its map."""
-    shown = _grid(report.grid_png) if report.grid_png else _plan(report)
+    if report.cloud_png:
+        shown = _cloud(report.cloud_png)
+    else:
+        shown = _grid(report.grid_png) if report.grid_png else _plan(report)
     return "\n".join(filter(None, [shown, _growth(report), _counts(report.mapping)]))
 
 
@@ -25,6 +28,17 @@ def _grid(png: bytes) -> str:
     caption = (
         "Walls are dark, free space is white, grey was never seen; the line is the path. The same "
         "grid is in grid.yaml and grid.pgm, which map_server loads."
+    )
+    return f"<figure>{drawn}<figcaption>{text(caption)}</figcaption></figure>"
+
+
+def _cloud(png: bytes) -> str:
+    """Return a map as a cloud: what LiDARs leave."""
+    drawn = image(png, "png", "Cloud from above: the ground, what stands on it, and the path")
+    caption = (
+        "From above: the ground is pale, what stands on it is the darker the higher it is; the "
+        "line is the path. The points are in cloud.ply, with intensities; grid.yaml and grid.pgm "
+        "are the slice of it that is in a robot's way."
     )
     return f"<figure>{drawn}<figcaption>{text(caption)}</figcaption></figure>"
 

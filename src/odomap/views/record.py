@@ -123,6 +123,7 @@ class Report:
         environment: versions and machine.
         map: what the map holds at the end, to be drawn; None for none.
         grid_png: a picture of the map as a grid, with the path; empty for none.
+        cloud_png: a picture of the map as a cloud from above; empty for none.
         growth: how the map and the memory grew, or None.
         mapping: what local mapping made and dropped, by name.
         beside_ms: what ran beside the frames: count, median, p95 and max by name.
@@ -148,6 +149,7 @@ class Report:
     environment: Mapping[str, str] = field(default_factory=environment)
     map: "MapView | None" = None
     grid_png: bytes = b""
+    cloud_png: bytes = b""
     growth: Growth | None = None
     beside_ms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mapping: Mapping[str, int] = field(default_factory=dict)

@@ -1,0 +1,85 @@
+"""A 3D LiDAR from the command line: run, its files, localise, continue, export."""
+
+import json
+
+import numpy as np
+import pytest
+
+from odomap.cli import main
+from odomap.files.clouds import read_ply_points
+from odomap.files.mapfile import load_map
+from odomap.files.pcd import read_pcd
+from odomap.files.trajectories import read_tum
+from odomap.sources.simulated import SimulatedSource
+
+WORLD = "sim:street?sensors=lidar3d&beams=16&frames={}&seed=1"
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "street"
+    assert main(["run", WORLD.format(60), "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+def test_a_run_leaves_path_map_cloud_and_grid(done):
+    metrics = json.loads((done / "metrics.json").read_text())
+    assert metrics["lost"] == 0
+    assert metrics["ate_rmse_m"] < 0.05
+    source = SimulatedSource(WORLD.format(60))
+    path = read_tum(done / "trajectory.tum")
+    assert path.stamps_ns.tolist() == source.truth.stamps_ns.tolist()
+    points = read_ply_points(done / "cloud.ply")
+    assert {"x", "y", "z", "intensity"} <= set(points.columns)
+    assert len(points.columns["x"]) > 20_000
+    assert float(np.max(points.columns["intensity"])) > 0.0
+    for name in ("cloud.png", "grid.yaml", "grid.pgm", "grid.png"):
+        assert (done / name).stat().st_size > 100
+    assert "cloud.ply" in (done / "report.html").read_text()
+
+
+def test_the_first_keyframe_has_no_cloud_as_its_motion_was_not_known(done):
+    kept = load_map(done / "map.odomap")
+    clouds = [kept.keyframe(k).cloud for k in kept.keyframe_ids.tolist()]
+    assert clouds[0] is None
+    assert all(cloud is not None and cloud.dtype == np.float32 for cloud in clouds[1:])
+
+
+def test_another_lidar_is_localised_in_its_map(done, tmp_path):
+    out = tmp_path / "there"
+    other = WORLD.replace("beams=16", "beams=32").format(25)
+    assert main(["localize", str(done), other, "--out", str(out), "--quiet"]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["lost"] <= 2
+    source = SimulatedSource(other)
+    path = read_tum(out / "trajectory.tum")
+    rows = np.searchsorted(source.truth.stamps_ns, path.stamps_ns)
+    origin = source.truth.Ts_world_body[0]  # the map's world is where it began
+    true = np.linalg.inv(origin) @ source.truth.Ts_world_body[rows]
+    off = np.linalg.norm(path.Ts_world_body[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert np.median(off) < 0.1
+    assert off.max() < 0.4
+
+
+def test_a_run_goes_on_where_the_map_ends(done, tmp_path):
+    out = tmp_path / "more"
+    assert main(["continue", str(done), WORLD.format(90), "--out", str(out), "--quiet"]) == 0
+    before, after = load_map(done / "map.odomap"), load_map(out / "map.odomap")
+    assert after.num_keyframes > before.num_keyframes
+    assert json.loads((out / "metrics.json").read_text())["lost"] == 0
+
+
+def test_the_cloud_is_exported_by_the_ending_of_its_name(done, tmp_path, capsys):
+    pcd, ply = tmp_path / "a.pcd", tmp_path / "b.ply"
+    assert main(["export", str(done), "--cloud", str(pcd)]) == 0
+    coarse = ["export", str(done / "map.odomap"), "--cloud", str(ply), "--voxel", "1.0"]
+    assert main([*coarse, "--no-picture"]) == 0
+    fine, thin = read_pcd(pcd).columns["x"], read_ply_points(ply).columns["x"]
+    assert len(thin) < 0.5 * len(fine)
+    assert (tmp_path / "a.png").exists()
+    assert not (tmp_path / "b.png").exists()
+    capsys.readouterr()
+    assert main(["export", str(done), "--cloud", str(tmp_path / "a.xyz")]) == 2
+    assert "a.xyz: give a name that ends in .ply or .pcd" in capsys.readouterr().err
+    assert main(["export", str(done), "--mesh", str(tmp_path / "m.ply")]) == 2
+    assert "give --cloud FILE" in capsys.readouterr().err
