@@ -74,8 +74,13 @@ class CloudSlam(System):
         if not self._config.cloud_closing.enabled:
             return None
         from odomap.system.cloudclosing import CloudCloser  # what compiles pose graphs
+        from odomap.system.cloudthinning import CloudThinner
 
-        return CloudCloser(self.map, self._mount.T_body_lidar.matrix, self._config.cloud_closing)
+        config = self._config
+        closer = CloudCloser(self.map, self._mount.T_body_lidar.matrix, config.cloud_closing)
+        if not config.cloud_thinning.enabled:
+            return closer
+        return CloudThinner(closer, config.cloud_thinning)
 
     def _front_end(self) -> FrontEnd[Any]:
         """Return what lays sweeps onto each other; only what is chosen is imported and compiled."""

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from odomap.errors import CalibrationError
 from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
+from odomap.geometry.so3 import orthonormalize
 from odomap.lidar.frontend import FrontEnd, SweepMatch
 from odomap.maps.edges import LOOP, ODOMETRY
 from odomap.maps.estimate import Estimate, Status
@@ -356,6 +357,8 @@ class CloudTracker:
         k = self._map.new_keyframe_id()
         cloud = None if twist is None else self._viewer.kept(view, twist)
         keyframe = Keyframe(k, view.frame.stamp_ns, cloud=cloud)
+        T_world_body = T_world_body.copy()  # rounding adds up from keyframe to keyframe
+        T_world_body[:3, :3] = orthonormalize(T_world_body[:3, :3])
         self._map.add_keyframe(keyframe, T_world_body, parent=parent, covariance=covariance)
         self._keyframe, self._T_odom_keyframe = k, self._T_odom_body
         self._drift = np.zeros((6, 6))

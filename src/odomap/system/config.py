@@ -30,6 +30,7 @@ from odomap.system.candidates import CandidateConfig
 from odomap.system.cloudconfig import (
     CloudClosingConfig,
     CloudRecognitionConfig,
+    CloudThinningConfig,
     CloudTrackingConfig,
 )
 from odomap.system.creating import CreateConfig
@@ -141,6 +142,8 @@ class Config:
     """What a sweep must show to be recognised in a map."""
     cloud_closing: CloudClosingConfig = field(default_factory=CloudClosingConfig)
     """When places seen before are searched for, and the path is corrected."""
+    cloud_thinning: CloudThinningConfig = field(default_factory=CloudThinningConfig)
+    """When keyframes of a LiDAR go that show nothing new."""
     threads: ThreadConfig = field(default_factory=ThreadConfig)
     """When what is found beside the tracker reaches it."""
 
