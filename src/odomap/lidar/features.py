@@ -49,6 +49,8 @@ POOR = 0.6
 """Share of the features that fit, of what it was before, below which the prediction was poor."""
 COARSE = 1.25
 """Voxel in which sweeps are laid onto one another, in voxels of planes."""
+MANY = 8000
+"""Points of planes from which on a sweep is dense."""
 FEWEST = 20
 """Points of a sweep that can be laid onto another."""
 
@@ -192,6 +194,10 @@ class LocalFeatures:
 
 
 def suitable_voxel(points: Array, config: FeatureMapConfig) -> float:
-    """Return a voxel for a place: a share of how far half of what is seen is away."""
+    """Return a voxel for a place: a share of how far half of what is seen is away.
+
+    Where points are few it is larger, up to twice, so that as many as else are in one.
+    """
     away = float(np.median(np.linalg.norm(points, axis=1)))
-    return float(np.clip(config.voxel_share * away, config.least_voxel, config.most_voxel))
+    voxel = float(np.clip(config.voxel_share * away, config.least_voxel, config.most_voxel))
+    return voxel * float(np.clip(np.sqrt(MANY / len(points)), 1.0, 2.0))
