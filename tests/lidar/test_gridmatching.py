@@ -120,7 +120,7 @@ def everything(pyramid, points, middle, reach, turn):
     """Return the best total by trying all poses."""
     step = pyramid.resolution / np.linalg.norm(points, axis=1).max()
     count, cells = int(np.ceil(turn / step)), int(np.ceil(reach / pyramid.resolution))
-    level, best = pyramid._levels[0], -1
+    level, best = np.array([0, 128, 0, 255])[pyramid._cells & 3], -1
     for heading in middle[2] + step * np.arange(-count, count + 1):
         at = moved((*middle[:2], heading), points) - pyramid._origin
         column, row = np.floor(at / pyramid.resolution).astype(int).T
@@ -130,6 +130,22 @@ def everything(pyramid, points, middle, reach, turn):
                 inside = (x >= 0) & (y >= 0) & (x < level.shape[1]) & (y < level.shape[0])
                 best = max(best, int(level[y[inside], x[inside]].astype(int).sum()))
     return best / (255 * len(points))
+
+
+def test_a_level_of_a_pyramid_has_the_best_of_squares_of_the_one_below(room):
+    top = 7
+    bits = GridPyramid(room, top)._cells
+    below = bits & 3
+    assert set(np.unique(below).tolist()) == {0, 1, 3}
+    for h in range(top):
+        padded = np.pad(below, (0, 1 << h))
+        corners = padded[:, : below.shape[1]], padded[:, 1 << h :]
+        expected = np.maximum(*corners)
+        expected = np.maximum(expected[: below.shape[0]], expected[1 << h :])
+        below = bits >> (2 * h + 2) & 3
+        np.testing.assert_array_equal(below, expected)
+    with pytest.raises(ValueError, match=r"squares of 2\^8 cells: 2\^7 at most"):
+        GridPyramid(room, 8)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -11,7 +11,10 @@ what the best cell near each point could give,
 so that a whole square of them is passed over where its bound is not above the best found. Squares
 are split into four, the most promising first. The result is that of trying everything.
 
-Cost: O(cells · levels) for the pyramid of a grid; a search some milliseconds.
+m has three values, so two bits hold it, 00, 01 and 11, of which the greater is a | b; a cell's bits
+of all levels are side by side in one number.
+
+Cost: O(cells · levels) for the pyramid of a grid, 2 bytes a cell; a search some milliseconds.
 
 Reference: W. Hess, D. Kohler, H. Rapp, D. Andor, "Real-time loop closure in 2D LIDAR SLAM", ICRA
 2016; E. Olson, "Real-time correlative scan matching", ICRA 2009.
@@ -28,12 +31,17 @@ from odomap.lidar.grid import OccupancyGrid, beside, is_wall
 __all__ = ["Found", "GridPyramid"]
 
 Array = NDArray[np.float64]
-Levels = NDArray[np.uint8]
+Level = NDArray[np.uint8]
+Levels = NDArray[np.uint16]
 Index = NDArray[np.int64]
 Columns = NDArray[np.int32]
 
-FULL, HALF = np.uint8(255), np.uint8(128)
-"""m = 1 and 1/2, as they are kept."""
+FULL, HALF = 255, 128
+"""m = 1 and 1/2, as they are added up."""
+IS_FULL, IS_HALF = np.uint8(0b11), np.uint8(0b01)
+"""The same as they are kept."""
+LEVELS = 8
+"""Levels that the number of a cell has bits for."""
 MOST = 180
 """Points that are searched with; of more every second, third, ..., for neighbours say the same."""
 FAR = 0.8
@@ -58,19 +66,24 @@ class GridPyramid:
 
     Args:
         grid: it is copied.
-        levels: so that the largest squares are 2^levels wide.
+        levels: so that the largest squares are 2^levels wide, 7 at most.
     """
 
     def __init__(self, grid: OccupancyGrid, levels: int = 6) -> None:
+        if levels >= LEVELS:
+            raise ValueError(f"squares of 2^{levels} cells: 2^{LEVELS - 1} at most")
+        self._top, room = levels, 1 << levels
         part = grid.cropped()
-        self.resolution, room = grid.resolution, 1 << levels
+        self.resolution = grid.resolution
         self._origin = part.origin - room * grid.resolution
         walls = is_wall(part)
         height, width = walls.shape
-        self._levels: Levels = np.zeros((levels + 1, height + room, width + room), np.uint8)
-        self._levels[0, room:, room:] = np.where(walls, FULL, HALF * beside(walls))
+        level: Level = np.zeros((height + room, width + room), np.uint8)
+        level[room:, room:] = np.where(walls, IS_FULL, IS_HALF * beside(walls))
+        self._cells: Levels = level.astype(np.uint16)
         for h in range(levels):
-            widen(self._levels[h], 1 << h, self._levels[h + 1])
+            level = widened(level, 1 << h)
+            self._cells |= level.astype(np.uint16) << (2 * h + 2)
 
     def search(
         self, points_body: Array, x_middle: Array, reach: float, turn: float, least: float
@@ -103,9 +116,9 @@ class GridPyramid:
         )
         cells = int(np.ceil(reach / self.resolution))
         best = np.zeros(3, np.int64)
-        full = int(FULL) * len(points_body)
+        full = FULL * len(points_body)
         bound = int(least * full)
-        total = search_kernel(self._levels, columns, rows, cells, bound, best)
+        total = search_kernel(self._cells, self._top, columns, rows, cells, bound, best)
         if total <= bound:
             return None
         shift = self.resolution * best[1:]
@@ -113,42 +126,50 @@ class GridPyramid:
         return Found(found, total / full)
 
 
-def widen(level: Levels, by: int, wider: Levels) -> None:
-    """wider(c) ← max of level at c, c + (by, 0), c + (0, by), c + (by, by)."""
+def widened(level: Level, by: int) -> Level:
+    """Return the max of a level at c, c + (by, 0), c + (0, by) and c + (by, by), for all c."""
     across = level.copy()
-    np.maximum(level[:, :-by], level[:, by:], out=across[:, :-by])
-    wider[:] = across
-    np.maximum(across[:-by], across[by:], out=wider[:-by])
+    across[:, :-by] |= level[:, by:]
+    both = across.copy()
+    both[:-by] |= across[by:]
+    return both
 
 
 @kernel
-def total_of(level: Levels, columns: Columns, rows: Columns, a: int, x: int, y: int) -> int:
+def total_of(cells: Levels, h: int, columns: Columns, rows: Columns, a: int, x: int, y: int) -> int:
     """Σ_i m_h(c_i + (x, y)) of heading a."""
-    height, width = level.shape
-    total = 0
+    height, width = cells.shape
+    halves, fulls = 0, 0
     for i in range(columns.shape[1]):
         column, row = columns[a, i] + x, rows[a, i] + y
         if column >= 0 and row >= 0 and column < width and row < height:
-            total += level[row, column]
-    return total
+            m = cells[row, column] >> (2 * h)
+            halves += m & 1
+            fulls += (m >> 1) & 1
+    return HALF * halves + (FULL - HALF) * fulls
 
 
 @kernel
 def search_kernel(
-    levels: Levels, columns: Columns, rows: Columns, reach: int, bound: int, best: Index
+    cells: Levels,
+    top: int,
+    columns: Columns,
+    rows: Columns,
+    reach: int,
+    bound: int,
+    best: Index,
 ) -> int:
     """Depth first through squares of shifts in [-reach, reach]², the best bounds first.
 
     Returns the best total above the bound, or the bound; best ← heading, shift in x and y.
     """
-    top, headings = len(levels) - 1, len(columns)
-    side = 1 << top
+    side, headings = 1 << top, len(columns)
     across = (2 * reach + side) // side
     bounds = np.empty(headings * across * across, np.int64)
     for a in range(headings):
         for n in range(across * across):
             x, y = -reach + side * (n % across), -reach + side * (n // across)
-            bounds[a * across * across + n] = total_of(levels[top], columns, rows, a, x, y)
+            bounds[a * across * across + n] = total_of(cells, top, columns, rows, a, x, y)
     order = np.argsort(-bounds, kind="mergesort")
     stack = np.empty((4 * (top + 1) + 1, 5), np.int64)  # level, heading, x, y, bound
     four = np.empty(4, np.int64)
@@ -173,7 +194,7 @@ def search_kernel(
                 x_k, y_k = x + half * (k % 2), y + half * (k // 2)
                 four[k] = -1
                 if x_k <= reach and y_k <= reach:
-                    four[k] = total_of(levels[h - 1], columns, rows, a, x_k, y_k)
+                    four[k] = total_of(cells, h - 1, columns, rows, a, x_k, y_k)
             for _ in range(4):  # the worst first onto the stack, so that the best comes first off
                 worst = -1
                 for k in range(4):

@@ -223,6 +223,7 @@ class OccupancyGrid:
         if finished.hits is not None:
             mean = finished.hits / np.maximum(finished.hits[:, :, 2:], 1.0)
             finished.hits = np.round(255.0 * mean).astype(np.uint8)
+        finished._marks = np.zeros((0, 0), np.int32)
         return finished
 
     def _hold(self, *points: Array) -> None:

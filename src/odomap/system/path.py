@@ -7,11 +7,12 @@ the world its covariance is that of its keyframe, carried over, plus that of the
 
     Σ_frame = Ad(T_body_keyframe) Σ_keyframe Ad(T_body_keyframe)ᵀ + Σ_relative.
 
+Frames are rows of numbers (`pathrows`); only the last one is kept as it was given.
+
 Reference: Barfoot, Furgale, "Associating Uncertainty With Three-Dimensional Poses", T-RO 2014.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from odomap.geometry.lie_kernels import se3_log_into
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.map import Map
 from odomap.maps.states import compose, stretched
+from odomap.system.pathrows import PathRows
 
 __all__ = ["ASTRAY", "Path", "Placed"]
 
@@ -57,8 +59,9 @@ class Path:
 
     def __init__(self, map: Map) -> None:
         self._map = map
-        self._frames: list[Placed] = []
-        self._live: list[tuple[int, Array, Array]] = []
+        self._frames, self._live = PathRows(), PathRows()
+        self._last: Placed | None = None
+        self._T_live = np.eye(4)
         self._relative = np.zeros((6, 6))
         self._fastest, self._units = np.zeros(2), 1.0
         # The last frame as known when the map was of this version.
@@ -68,12 +71,14 @@ class Path:
         return len(self._frames)
 
     def __getitem__(self, place: int) -> Placed:
-        return self._frames[place]
+        return Placed(*self._frames[place])
 
     @property
     def last(self) -> Placed:
         """The last frame placed."""
-        return self._frames[-1]
+        if self._last is None:
+            raise IndexError("the path has no frame yet")
+        return self._last
 
     def hang(
         self, stamp_ns: int, keyframe_id: int, T_world_body: Array, covariance: Array
@@ -98,7 +103,8 @@ class Path:
         T_world_body, scale = self._known_last()
         self._relative = stretched(frame.covariance, scale)
         covariance = self.covariance(frame)
-        self._live.append((frame.stamp_ns, T_world_body, covariance))
+        self._live.append(frame.stamp_ns, -1, T_world_body, covariance)
+        self._T_live = T_world_body
         seconds = self._last_seconds()
         if seconds > 0.0:
             self._fastest = np.maximum(self._fastest, _lengths(before, T_world_body) / seconds)
@@ -112,7 +118,9 @@ class Path:
         """Hang one of the frames anew."""
         if place == len(self) - 1:
             self._measure_speeds_by(frame)
-        self._frames[place], self._version = frame, -1
+            self._last = frame
+        self._frames.replace(place, *_numbers(frame))
+        self._version = -1
 
     def append_late(self, frame: Placed) -> None:
         """Add a frame that could not be placed when it came; it is no part of the live path."""
@@ -131,32 +139,30 @@ class Path:
         """
         if len(self._frames) < 3:
             return False
-        step = (
-            1e-9 * (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * self._highest_speed()
-        )
+        step = 1e-9 * self._last_step_ns() * self._highest_speed()
         sigma = np.sqrt(np.diag(covariance).reshape(2, 3).max(axis=1))
         apart = _lengths(T_expected, T_found)
         return bool((apart > np.maximum(LEAP * step, SIGMAS * sigma)).any())
 
     def correction(self) -> str:
         """Say in a sentence if the map has been corrected so that the last pose leapt; else ""."""
-        if not self._live or self._live[-1][0] != self.last.stamp_ns:
+        if not len(self._live) or self._live.stamp_ns(-1) != self.last.stamp_ns:
             return ""
-        then, now = self._live[-1][1], self._known_last()[0]
+        then, now = self._T_live, self._known_last()[0]
         if now is then or not self.is_leap(then, now, self._relative):
             return ""
         return f"the map was corrected: the last pose moved by {_lengths(then, now)[0]:.2g}"
 
     def last_covariance(self) -> Array:
         """Return the last frame's covariance (6, 6) as known now; zero before there is one."""
-        return self.covariance(self._frames[-1]) if self._frames else np.zeros((6, 6))
+        return np.zeros((6, 6)) if self._last is None else self.covariance(self._last)
 
     def velocity(self) -> Array:
         """Return the twist (6,) between the last two frames, per second; zero if they are apart."""
         seconds = self._last_seconds()
         if seconds <= 0.0:
             return np.zeros(6)
-        T_before, T_last = self._pose(self._frames[-2]), self._known_last()[0]
+        T_before, T_last = self._pose(self[-2]), self._known_last()[0]
         return np.asarray(se3_log(se3_inverse(T_before) @ T_last) / seconds)
 
     def covariance(self, frame: Placed) -> Array:
@@ -174,26 +180,24 @@ class Path:
 
     def trajectory(self) -> Trajectory:
         """Return T_world_body of all frames as known now, with covariances."""
-        return self._known(self._frames)
+        return self._known(np.ones(len(self), bool))
 
     def keyframes(self) -> Trajectory:
         """Return the keyframes among the frames, those that hang from themselves, as known now."""
-        keyframes = [
-            f
-            for f in self._frames
-            if self._map.is_keyframe_alive(f.keyframe_id)
-            and self._map.keyframe(f.keyframe_id).stamp_ns == f.stamp_ns
-        ]
-        return self._known(keyframes)
+        ids = self._frames.keyframe_ids
+        distinct, places = np.unique(ids, return_inverse=True)
+        stamps_ns = [self._stamp_ns_of(k) for k in distinct.tolist()]
+        is_itself = np.array([at is not None for at in stamps_ns], bool)[places]
+        of_keyframe = np.array([at or 0 for at in stamps_ns], np.int64)[places]
+        return self._known(is_itself & (of_keyframe == self._frames.stamps_ns))
 
     def trajectory_live(self) -> Trajectory:
         """Return the frames placed at once, as they were then."""
-        stamps, Ts, covariances = zip(*self._live, strict=True) if self._live else ((), (), ())
-        return _trajectory(stamps, np.array(Ts), np.array(covariances))
+        return _trajectory(self._live.stamps_ns, *self._live.matrices())
 
     def _add(self, frame: Placed) -> None:
-        self._frames.append(frame)
-        self._version = -1
+        self._frames.append(*_numbers(frame))
+        self._last, self._version = frame, -1
 
     def _measure_speeds_by(self, frame: Placed) -> None:
         """Let the units of a frame's keyframe be those that speeds so far are stretched with."""
@@ -201,7 +205,7 @@ class Path:
 
     def _highest_speed(self) -> Array:
         """Return the fastest (2,) so far, a length and an angle per second, in units as of now."""
-        if not self._frames:
+        if self._last is None:
             return self._fastest
         return self._fastest * (self._known_last()[1] / self._units, 1.0)
 
@@ -209,8 +213,17 @@ class Path:
         """Return the time between the last two frames; 0 if they are apart, or in no order."""
         if len(self._frames) < 2:
             return 0.0
-        seconds = (self._frames[-1].stamp_ns - self._frames[-2].stamp_ns) * 1e-9
+        seconds = self._last_step_ns() * 1e-9
         return seconds if 0.0 < seconds <= 1.0 else 0.0
+
+    def _last_step_ns(self) -> int:
+        return self._frames.stamp_ns(-1) - self._frames.stamp_ns(-2)
+
+    def _stamp_ns_of(self, keyframe_id: int) -> int | None:
+        """Return the time of a keyframe; None if it is gone."""
+        if not self._map.is_keyframe_alive(keyframe_id):
+            return None
+        return self._map.keyframe(keyframe_id).stamp_ns
 
     def _pose(self, frame: Placed) -> Array:
         return self._map.place(frame.keyframe_id, frame.T_keyframe_body)
@@ -221,26 +234,27 @@ class Path:
         The same array as before where the map has not changed.
         """
         version = self._map.version
-        if self._frames and self._version != version:
-            self._T_last = self._pose(self.last)
-            self._scale_last = self._map.scale(self.last.keyframe_id)
+        if self._last is not None and self._version != version:
+            self._T_last = self._pose(self._last)
+            self._scale_last = self._map.scale(self._last.keyframe_id)
             self._version = version
         return self._T_last, self._scale_last
 
-    def _known(self, frames: Sequence[Placed]) -> Trajectory:
-        """Return where frames are, as known now."""
-        if not frames:
-            return _trajectory((), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
-        ids = [frame.keyframe_id for frame in frames]
-        Ts, relative = (
-            np.array([getattr(f, name) for f in frames])
-            for name in ("T_keyframe_body", "covariance")
-        )
+    def _known(self, rows: NDArray[np.bool_]) -> Trajectory:
+        """Return where some of the frames are, (N,) whether they are asked for, as known now."""
+        stamps_ns, ids = self._frames.stamps_ns[rows], self._frames.keyframe_ids[rows]
+        Ts, relative = self._frames.matrices(rows)
+        if not len(ids):
+            return _trajectory(stamps_ns, Ts, relative)
         with self._map.lock:
             placements, sure = self._map.placements(ids), self._map.covariances(ids)
         covariances = _in_world(sure, placements[1], Ts, relative)
         Ts_world_body, _ = compose(placements, (Ts, np.ones(len(ids))))
-        return _trajectory([f.stamp_ns for f in frames], Ts_world_body, covariances)
+        return _trajectory(stamps_ns, Ts_world_body, covariances)
+
+
+def _numbers(frame: Placed) -> tuple[int, int, Array, Array]:
+    return frame.stamp_ns, frame.keyframe_id, frame.T_keyframe_body, frame.covariance
 
 
 def _in_world(
@@ -261,8 +275,6 @@ def _lengths(T_from: Array, T_to: Array) -> Array:
     return np.array([math.hypot(*xi[:3]), math.hypot(*xi[3:])])
 
 
-def _trajectory(stamps: Sequence[int], Ts: Array, covariances: Array) -> Trajectory:
-    stamps_ns = np.array(stamps, np.int64)
+def _trajectory(stamps_ns: NDArray[np.int64], Ts: Array, covariances: Array) -> Trajectory:
     order = np.argsort(stamps_ns, kind="stable")  # clocks of old logs jump back
-    Ts, covariances = Ts.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6)
     return Trajectory(stamps_ns[order], Ts[order], covariances[order])
