@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from odomap.backend.descent import SolverConfig
 from odomap.backend.graphs.covariances import GraphCovariances
-from odomap.backend.graphs.gnc import find_inliers
+from odomap.backend.graphs.gnc import GncConfig, find_inliers
 from odomap.backend.graphs.solve import solve
 from odomap.geometry.robust import Loss
 from odomap.system.essentialgraph import EssentialGraph
@@ -48,7 +48,12 @@ class SolvedLoops:
 
 
 def solve_loops(
-    graph: EssentialGraph, is_false: Bool, doubt: float, outlying: float, decides: bool
+    graph: EssentialGraph,
+    is_false: Bool,
+    doubt: float,
+    outlying: float,
+    decides: bool,
+    gnc: GncConfig | None = None,
 ) -> SolvedLoops:
     """Find the poses that agree best with steps and loops.
 
@@ -58,10 +63,11 @@ def solve_loops(
         doubt: factor on all standard deviations while it is decided who is.
         outlying: standard deviations at which a loop counts half.
         decides: whether it is decided anew.
+        gnc: how.
     """
     is_true = ~is_false
     if decides and graph.is_doubted.any():
-        inliers = find_inliers(graph, np.full(graph.num_edges, doubt**-2))
+        inliers = find_inliers(graph, np.full(graph.num_edges, doubt**-2), gnc)
         is_true = inliers.is_inlier | ~graph.is_doubted
         graph = graph.placed(inliers.Ts_world_node)
     solution = solve(

@@ -3,9 +3,10 @@
 A new keyframe may show what an old, finished submap holds. How far it may have drifted from there
 is known, and in a window of that size branch and bound finds the best of all poses, or says that
 none is good enough; where it found one the scan is matched exactly. Each that holds is an edge
-between the submap's anchor and the keyframe. After some of them the path is solved anew
-(`scangraph`). Whenever there are half as many loops again, and at the end, it is decided anew which
-of them the others contradict; these are left out until then.
+between the submap's anchor and the keyframe, as unsure as the match and the walls there together.
+After some of them the path is solved anew (`scangraph`). Whenever there are half as many loops
+again, and at the end, it is decided anew which of them the others contradict; these are left out
+until then.
 
 Cost: a search some milliseconds, two at a keyframe at most; a solution O(K).
 
@@ -213,7 +214,7 @@ class ScanCloser:
                     keyframe.id,
                     candidate.x_guess,
                     match.x_grid_body,
-                    match.information,
+                    _less_sure(match.information, submap.drift_near(match.x_grid_body)),
                     count,
                 )
             )
@@ -248,6 +249,12 @@ class ScanCloser:
             self._tied[tie.submap.anchor_id] = tie.keyframe_id
             self._pending += 1
             self._num_loops += 1
+
+    def forget(self) -> None:
+        """Let the pyramids of submaps go that have gone."""
+        left = {submap.anchor_id for submap in self._submaps.finished}
+        for gone in self._pyramids.keys() - left:
+            del self._pyramids[gone]
 
     def disbelieve(self, false: Index) -> None:
         """Keep which loops (n, 2), keyframe and anchor, are contradicted by the others."""
@@ -325,3 +332,10 @@ class ScanClosingChange:
             )
             self.closer.disbelieve(solved.false)
         self.closer.tie(self.ties, map)
+        self.closer.forget()
+
+
+def _less_sure(information: Array, covariance: Array) -> Array:
+    """Return (Λ⁻¹ + Σ)⁻¹ of information Λ (3, 3) that may be singular, and a covariance Σ."""
+    less = np.linalg.solve(np.eye(3) + information @ covariance, information)
+    return np.asarray(0.5 * (less + less.T))

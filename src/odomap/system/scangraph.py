@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.backend.graphs.gnc import GncConfig
 from odomap.geometry.planar import (
     IN_PLANE,
     between_planar,
@@ -45,6 +46,9 @@ Pair = tuple[int, int]
 
 UNKNOWN = np.diag([1e-4, 1e-4, 0.1])
 """Information of the step from one piece of the map to the next: it keeps the graph in one."""
+AS_STATED = GncConfig(least_variance=1.0)
+"""Two submaps say one measurement of a keyframe, so that what is left of submap edges is next to
+nothing and tells nothing of how sure loops are; no gate is made narrower by that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +100,7 @@ class ScanGraph:
         """
         order = np.argsort(self.snapshot.keyframe_ids)
         limits = config.doubt, config.outlying
-        solved = solve_loops(self._edges(order), self.is_false, *limits, decides)
+        solved = solve_loops(self._edges(order), self.is_false, *limits, decides, AS_STATED)
         T = solved.Ts_world_node  # rotations to the digits of a solver: made anew from headings
         x = np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
         is_false = ~solved.is_true

@@ -61,6 +61,7 @@ class Submap:
         covariance: (3, 3) of that, right tangent.
         x_anchor_keyframe: (3,) its newest keyframe.
         drift: (3, 3) how unsure its newest walls are in its frame, tangent at the anchor.
+        places: of each keyframe in it: where (3,), and the drift (3, 3) of walls that it added.
     """
 
     anchor_id: int
@@ -70,6 +71,7 @@ class Submap:
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     x_anchor_keyframe: Array = field(default_factory=lambda: np.zeros(3))
     drift: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    places: list[tuple[Array, Array]] = field(default_factory=list)
 
     def insert(self, keyframe_id: int, scan: ScanPoints, x_anchor_body: Array) -> None:
         """Add the scan of a keyframe."""
@@ -78,17 +80,24 @@ class Submap:
         n, m = len(scan.hits), len(scan.hits) + len(scan.between)
         self.grid.insert(points[-1], points[:n], between=points[n:m], free=points[m:-1])
         self.keyframe_ids.append(keyframe_id)
+        self.places.append((x_anchor_body, self.drift))
         self.x_anchor_keyframe = x_anchor_body
 
     def extend(self, covariance: Array) -> None:
         """Let the newest walls be less sure than those before by (3, 3), tangent at the body."""
         to_anchor = between_planar(self.x_anchor_body, np.zeros(3))
         self.drift = self.drift + moved_covariance(covariance, to_anchor)
+        self.places[-1] = self.places[-1][0], self.drift
 
     @property
     def whole_covariance(self) -> Array:
         """(3, 3) of where the body is, relative to the anchor and not to the walls around."""
         return self.covariance + moved_covariance(self.drift, self.x_anchor_body)
+
+    def drift_near(self, x_anchor_body: Array) -> Array:
+        """Return how unsure (3, 3) the walls around a pose (3,) are, tangent at the body there."""
+        apart = [float(np.hypot(*(x - x_anchor_body)[:2])) for x, _ in self.places]
+        return moved_covariance(self.places[int(np.argmin(apart))][1], x_anchor_body)
 
     @property
     def middle(self) -> Array:

@@ -207,6 +207,8 @@ def test_limits_of_the_config():
         GncConfig(quantile=1.0)
     with pytest.raises(ConfigError, match="growth"):
         GncConfig(growth=1.0)
+    with pytest.raises(ConfigError, match="least_variance"):
+        GncConfig(least_variance=0.0)
 
 
 @each_group

@@ -77,6 +77,9 @@ class GncConfig:
     """Factor of the convexity parameter from round to round."""
     rounds: Annotated[int, Limits(least=1)] = 100
     """Most rounds of each stage."""
+    least_variance: Annotated[float, Limits(least=LEAST_VARIANCE, most=1.0)] = LEAST_VARIANCE
+    """How modest the information may seem. What is trusted may say one measurement twice, and
+    agrees with itself then: a graph of such, or one too modest on purpose, has 1."""
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -146,7 +149,7 @@ class _Search:
         self.graph, self.config, self.stop = graph, config, stop
         self.subgraph = Subgraph(graph, stop)
         self.consensus = find_consensus(graph, None, config.quantile)
-        self.variance, self.rounds = self.consensus.variance, 0
+        self.variance, self.rounds = max(self.consensus.variance, config.least_variance), 0
         self.quantile = chi2_quantile(graph.dim, config.quantile)
         self.gate = self.quantile * max(self.variance, 1.0)
 
@@ -173,7 +176,7 @@ class _Search:
         """Take the variance factor from the graph as it stands; return how many loops it has."""
         count = int((chosen & self.graph.is_loop).sum())
         if self.now.redundancy >= _FEWEST and count:
-            self.variance = max(self.now.variance, LEAST_VARIANCE)
+            self.variance = max(self.now.variance, self.config.least_variance)
         return count
 
     def _truncated_squares(self, solution: SubgraphSolution | None = None) -> float:
