@@ -30,7 +30,11 @@ LATE = ("odomap.geometry.", "odomap.maps.views_kernels")
 LOOPS = ("odomap.geometry.alignransac_kernels", "odomap.geometry.horn_kernels")
 """Those of them that only serve where loops are closed."""
 CLOSER = "odomap.system.closing"
-"""Imported where loops are closed."""
+"""Imported where loops of cameras are closed."""
+SIGHT = tuple(f"odomap.geometry.{name}_kernels" for name in ("lens", "p3p", "pnp"))
+"""Those of them that only serve where images are looked at."""
+EYES = "odomap.vision.features"
+"""Imported where they are."""
 F = TypeVar("F", bound=Callable[..., object])
 
 
@@ -94,6 +98,8 @@ def needed_modules() -> list[str]:
     late = [n for n in modules_with_kernels() if n.startswith(LATE)]
     if CLOSER not in imported:
         late = [n for n in late if n not in LOOPS]
+    if EYES not in imported:
+        late = [n for n in late if n not in SIGHT]
     return [n for n in modules_with_kernels() if n in imported or n in late]
 
 

@@ -219,6 +219,19 @@ def test_fused_removed_and_culled_things_do_not_disturb(vocabulary):
     assert found.keyframe_id not in (2, 3)
 
 
+def test_landmarks_that_no_keyframe_is_said_to_show_are_no_place(vocabulary, monkeypatch):
+    """A map may hide who observed them, as one does that is to forget (`benchmarks/loopcases`)."""
+    world = Room(8, 900)
+    m, _ = world.map(world.ring(12))
+    nobody = np.zeros(0, np.int64)
+    looks, pixels, levels, _ = world.view(world.pose((0.1, -0.2), 1.0))
+    finder = recognizer(m, vocabulary=vocabulary)
+    monkeypatch.setattr(m, "observing", lambda landmark_ids: (nobody, nobody))
+    said = finder.find(looks, pixels, levels, seed=1)
+    assert isinstance(said, str)
+    assert said
+
+
 def test_a_map_that_grows_and_shrinks_is_followed():
     """Keyframes are recognised as soon as they are there, and no longer when they are gone."""
     world = Room(5)

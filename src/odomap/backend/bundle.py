@@ -14,11 +14,11 @@ Time Localization and 3D Reconstruction", CVPR 2006 (windows).
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odomap.backend.bundleconfig import BundleConfig
 from odomap.backend.cholesky import factor, invert, solve
 from odomap.backend.schur import (
     CameraArrays,
@@ -33,7 +33,6 @@ from odomap.backend.schur import (
 from odomap.errors import InputError
 from odomap.geometry.lie_kernels import se3_retract
 from odomap.kernels import kernel
-from odomap.limits import Limits, NotNegative, Positive, check_limits
 
 __all__ = ["Bundle", "BundleConfig", "BundleSolution", "solve_bundle", "warm_up"]
 
@@ -41,21 +40,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 REASONS = ("iteration limit", "converged", "no step lowers the cost", "the system is singular")
-
-
-@dataclass(frozen=True)
-class BundleConfig:
-    """How a bundle is solved."""
-
-    iterations: Annotated[int, Limits(least=0)] = 4
-    """Most Levenberg-Marquardt steps tried."""
-    huber_width: Positive = 2.5
-    """Residual, in standard deviations, beyond which Huber's loss grows linearly."""
-    tolerance: NotNegative = 3e-3
-    """Relative decrease of the cost below which the solver stops."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True)

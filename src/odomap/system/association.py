@@ -11,12 +11,12 @@ Reference: Baker, Matthews, "Lucas-Kanade 20 Years On", IJCV 2004; Mur-Artal, Mo
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.limits import Count, Fraction, Limits, NotNegative, check_limits
+from odomap.system.visualconfig import TrackingConfig
 from odomap.vision.features import Corners, FeatureConfig, describe, detect
 from odomap.vision.flow import FlowConfig, pyramid, track
 from odomap.vision.matching import MatchConfig, match_guided
@@ -37,36 +37,6 @@ REACH = 0.08
 """How far descriptors are looked for where nothing predicts a motion, as part of the width."""
 _AS_ONE = np.array([1.0, 1j])
 """Makes one number of a pixel, which can be looked up."""
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """How frames are placed and when one becomes a keyframe."""
-
-    sensors: Literal["mono", "stereo", "rgbd", "lidar2d", "lidar"] = "stereo"
-    """mono: one camera, scale is free; stereo: a pair; rgbd: one camera with a depth image;
-    lidar2d: a laser, which no other section of cameras is of use to."""
-    association: Literal["features", "flow"] = "features"
-    """features: found in every frame and known by their descriptors; SLAM finds them on all levels
-    of a pyramid (`orb`), odometry with the detector of `features`. flow: patches followed from the
-    last keyframe by optical flow, for speed."""
-    min_inliers: Annotated[int, Limits(least=4)] = 15
-    """Observations that must agree with a pose for it to count as tracked."""
-    min_coverage: Fraction = 0.08
-    """Part of the image that they must be spread over, or half of what it was at the start."""
-    keyframe_ratio: Fraction = 0.85
-    """A keyframe is made when inliers fall below this fraction of those just after the last one."""
-    keyframe_motion: NotNegative = 0.04
-    """A keyframe is made when points have moved by this fraction of the image width (median)."""
-    keyframe_interval: Count = 20
-    """A keyframe is made after this many frames in any case."""
-    patience: Annotated[int, Limits(least=0)] = 5
-    """Frames that may be lost before odometry starts anew."""
-    max_prediction_s: NotNegative = 0.3
-    """Velocity is trusted for this long; after a longer gap it is not extrapolated further."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True)

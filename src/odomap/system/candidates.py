@@ -15,7 +15,6 @@ Reference: Klein, Murray, "Parallel Tracking and Mapping for Small AR Workspaces
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,10 @@ from scipy.spatial import cKDTree
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
 from odomap.geometry.triangulate import triangulate
-from odomap.limits import Count, Limits, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.system.association import Association, Candidates, Reference, View
 from odomap.system.firstsight import FirstSights
+from odomap.system.visualconfig import CandidateConfig
 from odomap.vision.flow import facing_warp
 
 __all__ = ["CandidateConfig", "Followed", "Follower"]
@@ -37,23 +36,6 @@ Index = NDArray[np.int64]
 
 NEIGHBOURS = 5
 """Landmarks around a candidate whose depth it is expected at."""
-
-
-@dataclass(frozen=True)
-class CandidateConfig:
-    """How corners without depth become landmarks."""
-
-    follow: bool = False
-    """Whether they are followed; if not, only corners with a measured depth are of use."""
-    min_parallax_deg: Annotated[float, Limits(above=0, most=180)] = 1.0
-    """Angle between two rays from which on they are triangulated."""
-    max_error_px: Positive = 1.5
-    """Largest distance of the point's projections from where it was seen (root mean square)."""
-    views: Count = 5
-    """Keyframes over which one is followed; after that it starts afresh."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

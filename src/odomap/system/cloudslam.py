@@ -9,7 +9,7 @@ path as it is known then.
 Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8(2), 2023.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from odomap.errors import CalibrationError, ConfigError
 from odomap.lidar.featureconfig import LegoConfig, LoamConfig
@@ -23,7 +23,9 @@ from odomap.system.config import Config, preset
 from odomap.system.path import Path
 from odomap.system.stages import Closer, Stages
 from odomap.system.system import System
-from odomap.vision.vocabulary import VocabularyTree
+
+if TYPE_CHECKING:
+    from odomap.vision.vocabulary import VocabularyTree
 
 __all__ = ["CloudSlam", "lidar_of"]
 
@@ -51,7 +53,7 @@ class CloudSlam(System):
         rhythm: str = "inline",
         map: Map | None = None,
         is_mapping: bool = True,
-        vocabulary: VocabularyTree | None = None,
+        vocabulary: "VocabularyTree | None" = None,
     ) -> None:
         if vocabulary is not None:
             raise ConfigError("vocabulary: a LiDAR knows no words: leave it out")

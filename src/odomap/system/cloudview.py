@@ -19,8 +19,8 @@ from odomap.lidar.sweeps import SweepPoints, points_of
 from odomap.lidar.voxels import first_in_voxels
 from odomap.sensors.frame import Frame
 from odomap.sensors.rig import LidarMount
+from odomap.system.clock import Clock
 from odomap.system.cloudconfig import CloudTrackingConfig
-from odomap.system.looking import Clock
 
 __all__ = ["CloudView", "CloudViewer"]
 

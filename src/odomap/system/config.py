@@ -7,54 +7,56 @@ file only gathers them and names the presets.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.backend.bundle import BundleConfig
+from odomap.backend.bundleconfig import BundleConfig
 from odomap.errors import CalibrationError, ConfigError, nearest_name
 from odomap.lidar.cloudconfig import PointsConfig
 from odomap.lidar.featureconfig import CurvatureConfig, FeatureMapConfig, GroundConfig
 from odomap.lidar.scanconfig import ScanConfig
 from odomap.sensors.rig import Rig
 from odomap.system.adjusting import AdjustingConfig
-from odomap.system.association import (
-    Association,
-    FeatureAssociation,
-    FlowAssociation,
-    TrackingConfig,
-)
 from odomap.system.background import ThreadConfig
-from odomap.system.candidates import CandidateConfig
 from odomap.system.cloudconfig import (
     CloudClosingConfig,
     CloudRecognitionConfig,
     CloudThinningConfig,
     CloudTrackingConfig,
 )
-from odomap.system.creating import CreateConfig
-from odomap.system.culling import CullConfig
-from odomap.system.fusing import FuseConfig
-from odomap.system.localmap import LocalMapConfig
-from odomap.system.localmapping import MappingConfig
-from odomap.system.loopsearch import ClosingConfig
-from odomap.system.mapping import WindowConfig
-from odomap.system.placeindex import PlacesConfig
 from odomap.system.scanconfig import (
     ScanClosingConfig,
     ScanThinningConfig,
     ScanTrackingConfig,
     SubmapConfig,
 )
-from odomap.system.uncertainty import NoiseConfig
-from odomap.vision.bootstrap import BootstrapConfig
-from odomap.vision.depth import DepthConfig
-from odomap.vision.features import FeatureConfig
-from odomap.vision.flow import FlowConfig
-from odomap.vision.matching import MatchConfig
-from odomap.vision.orb import OrbConfig
-from odomap.vision.stereo import StereoConfig
+from odomap.system.visualconfig import (
+    CandidateConfig,
+    ClosingConfig,
+    CreateConfig,
+    CullConfig,
+    FuseConfig,
+    LocalMapConfig,
+    MappingConfig,
+    NoiseConfig,
+    PlacesConfig,
+    TrackingConfig,
+    WindowConfig,
+)
+from odomap.vision.visionconfig import (
+    BootstrapConfig,
+    DepthConfig,
+    FeatureConfig,
+    FlowConfig,
+    MatchConfig,
+    OrbConfig,
+    StereoConfig,
+)
+
+if TYPE_CHECKING:
+    from odomap.system.association import Association
 
 __all__ = [
     "PRESETS",
@@ -275,13 +277,18 @@ def odometry_preset(rig: Rig) -> str:
     return f"{preset_for(rig)}-flow"
 
 
-def make_association(config: Config, mask: NDArray[np.bool_]) -> Association:
+def make_association(config: Config, mask: NDArray[np.bool_]) -> "Association":
     """Return the association that a configuration asks for, to make a map with.
 
     Args:
         config: the configuration.
         mask: (H, W) where the image holds something.
     """
+    from odomap.system.association import (  # which lasers need not
+        FeatureAssociation,
+        FlowAssociation,
+    )
+
     if config.tracking.association == "flow":
         return FlowAssociation(config.features, config.flow, mask, describes=True)
     return FeatureAssociation.of_pyramid(config.orb, config.matching, mask)

@@ -19,15 +19,14 @@ T-RO 2015, section VI-C.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_inverse
-from odomap.limits import Count, Limits, NotNegative, check_limits
 from odomap.system.creating_kernels import agree, judge
 from odomap.system.localwindow import LocalWindow
+from odomap.system.visualconfig import CreateConfig
 from odomap.vision.matching import EpipolarView, MatchConfig, match_epipolar
 
 __all__ = ["CreateConfig", "Created", "create_landmarks"]
@@ -37,23 +36,6 @@ Index = NDArray[np.int64]
 
 CHECKS = ("parallax", "behind", "reprojection", "scale")
 """Why a match makes no point, in the order in which it is asked."""
-
-
-@dataclass(frozen=True)
-class CreateConfig:
-    """Which matches become landmarks."""
-
-    neighbours: Count = 10
-    """Covisible keyframes in which keypoints are looked for."""
-    min_baseline: NotNegative = 0.01
-    """Distance from a neighbour relative to the median depth there, for a single camera."""
-    min_parallax_deg: Annotated[float, Limits(above=0, most=180)] = 1.15
-    """Angle between two rays, or what a measured depth is worth, from which depth is known."""
-    scale_tolerance: Annotated[float, Limits(least=1)] = 1.5
-    """Factor, besides that of one level, by which sizes in the image may contradict distances."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,49 +18,17 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, sections VI-B and VI-E.
 """
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.limits import Count, Fraction, Limits, check_limits
 from odomap.system.localwindow import LocalWindow
+from odomap.system.visualconfig import CullConfig
 
 __all__ = ["CullConfig", "poor_landmarks", "redundant_keyframes"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-Age = Annotated[int, Limits(least=0)]
-"""How many keyframes ago."""
-
-
-@dataclass(frozen=True)
-class CullConfig:
-    """What goes from the map."""
-
-    redundant: Fraction = 0.7
-    """Part of a keyframe's landmarks that others must see as well for it to go."""
-    observers: Count = 3
-    """Other keyframes that must see a landmark as well."""
-    keyframes: Count = 2
-    """Keyframes that may go at a time."""
-    min_found: Fraction = 0.1
-    """Part of the frames that expected a landmark in which it must be found."""
-    min_age: Age = 2
-    """Keyframes after its making from which on a landmark must have its observers."""
-    max_age: Age = 3
-    """Keyframes after its making until which a landmark is on probation."""
-    min_observers: Count = 3
-    """Keyframes that must see a landmark of a single camera."""
-    min_observers_ranged: Count = 2
-    """Keyframes that must see a landmark whose depth was measured."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def redundant_keyframes(

@@ -19,16 +19,15 @@ T-RO 2015, sections V-D and VI-C.
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_inverse
-from odomap.limits import Limits, Positive, check_limits
 from odomap.system.fusing_kernels import look, refind, stand_apart
 from odomap.system.joining import join
 from odomap.system.localwindow import LocalWindow
+from odomap.system.visualconfig import FuseConfig
 from odomap.vision.hamming import as_words
 from odomap.vision.matching import MatchConfig
 
@@ -40,19 +39,6 @@ Mask = NDArray[np.bool_]
 
 GATE, GATE_WITH_DEPTH = 5.991, 7.815
 """95 % of χ² with two and three degrees of freedom."""
-
-
-@dataclass(frozen=True)
-class FuseConfig:
-    """Where landmarks are looked for again."""
-
-    radius_px: Positive = 3.0
-    """Search radius around the expected position, in pixels of the expected level."""
-    max_angle_deg: Annotated[float, Limits(above=0, most=180)] = 60.0
-    """Angle from the mean direction of its observers beyond which a landmark looks different."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

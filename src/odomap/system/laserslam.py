@@ -12,6 +12,7 @@ Reference: W. Hess, D. Kohler, H. Rapp, D. Andor, "Real-time loop closure in 2D 
 """
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from odomap.errors import CalibrationError, ConfigError
 from odomap.lidar.scans import Beams
@@ -23,7 +24,9 @@ from odomap.system.scantracking import ScanTracker
 from odomap.system.stages import Closer, Stages
 from odomap.system.submaps import Submaps
 from odomap.system.system import System
-from odomap.vision.vocabulary import VocabularyTree
+
+if TYPE_CHECKING:
+    from odomap.vision.vocabulary import VocabularyTree
 
 __all__ = ["LaserSlam"]
 
@@ -54,7 +57,7 @@ class LaserSlam(System):
         rhythm: str = "inline",
         map: Map | None = None,
         is_mapping: bool = True,
-        vocabulary: VocabularyTree | None = None,
+        vocabulary: "VocabularyTree | None" = None,
     ) -> None:
         if vocabulary is not None:
             raise ConfigError("vocabulary: a laser knows no words: leave it out")

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
-from odomap.limits import Count, NotNegative, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.maps.views import LandmarkViews
 from odomap.system.dispute import SETTLED
 from odomap.system.maplocating_kernels import foresee
+from odomap.system.visualconfig import LocalMapConfig
 
 __all__ = [
     "Expected",
@@ -41,27 +41,6 @@ SIDE = 0.5
 """Cosine of the angle between the directions of view beyond which a landmark looks different."""
 MARGIN_PX = 2.0
 """Nearer to the rim of the image nothing is found."""
-
-
-@dataclass(frozen=True)
-class LocalMapConfig:
-    """What is searched for in a frame, and how."""
-
-    keyframes: Count = 20
-    """Keyframes whose landmarks are looked for, of those that share any with the last frame."""
-    near: Count = 5
-    """Further keyframes that look at the same place from nearby."""
-    near_distance: NotNegative = 0.3
-    """How near those are, as a fraction of the median distance of landmarks."""
-    near_angle_deg: NotNegative = 30.0
-    """How much their directions of view may differ."""
-    first_radius_px: Positive = 12.0
-    """Search radius around what motion predicts, on the finest level."""
-    radius_px: Positive = 4.0
-    """Search radius once the pose is known well, on the finest level."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,34 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.geometry.camera import Camera
-from odomap.limits import Count, Positive, check_limits
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot
 from odomap.system.chains import Chains, older_part
 from odomap.system.localmap import LocalMapConfig, median_distance, nearby
 from odomap.system.localwindow import by_id
+from odomap.system.visualconfig import MappingConfig
 
 __all__ = ["LocalPart", "MappingConfig", "choose_part"]
 
 UNSURE_PX = 20.0
 """Where landmarks may lie further off than this, what is found nearby would be something else."""
-
-
-@dataclass(frozen=True)
-class MappingConfig:
-    """Which part of the map is worked on when there is a new keyframe."""
-
-    size: Count = 10
-    """Keyframes adjusted: the new one and those that share most landmarks with it."""
-    fixed: Count = 10
-    """Further keyframes that see the same landmarks, and hold them in place."""
-    min_shared: Count = 15
-    """Landmarks that a keyframe must share with the new one to be adjusted with it."""
-    gate: Positive = 3.5
-    """Residual, in standard deviations, beyond which an observation is dropped."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

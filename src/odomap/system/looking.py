@@ -4,7 +4,6 @@ The image becomes that of an ideal pinhole, and its features are found. Not ever
 something: one may come late, without an image, or with that of the frame before.
 """
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,32 +12,15 @@ from numpy.typing import NDArray
 from odomap.geometry.camera import Camera
 from odomap.sensors.frame import Frame
 from odomap.system.association import Association, View
+from odomap.system.clock import Clock
 from odomap.system.eye import Eye
 from odomap.system.locating import Located
 from odomap.vision.coverage import coverage
 
-__all__ = ["Clock", "Look", "Looker", "Unseen", "doubt"]
+__all__ = ["Look", "Looker", "Unseen", "doubt"]
 
 BLANK = 8.0
 """Standard deviation of grey levels below which an image shows nothing."""
-
-
-class Clock:
-    """Milliseconds per stage; for people, nothing decides by it."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def resume(self) -> None:
-        """Let the time since the last lap belong to no stage."""
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Give the time since the last lap to a stage."""
-        now = time.perf_counter()
-        self.laps[stage] = self.laps.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
 
 
 @dataclass(frozen=True, eq=False)

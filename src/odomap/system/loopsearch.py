@@ -17,19 +17,18 @@ Reference: Mur-Artal, Montiel, Tardós, "ORB-SLAM: a versatile and accurate mono
 T-RO 2015, section VII-A.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.limits import Count, check_limits
 from odomap.maps.edges import LOOP
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.covisibility import Acquaintance, Carried, Covisibility, acquaint
 from odomap.system.placeindex import described
 from odomap.system.revisits import Revisit, RevisitConfig, Revisits
+from odomap.system.visualconfig import ClosingConfig
 from odomap.vision.places import Places
 from odomap.vision.vocabulary import VocabularyTree
 
@@ -37,27 +36,6 @@ __all__ = ["ClosingConfig", "LoopSearch", "News"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class ClosingConfig:
-    """When loops are looked for, and closed."""
-
-    enabled: bool = True
-    """Whether places seen before are recognised and the path is corrected there."""
-    recent: Count = 10
-    """Newest keyframes that are no places seen before."""
-    rest: Count = 10
-    """Keyframes after a loop was closed in which no other is."""
-    most: Count = 2
-    """Places that geometry is asked about at a keyframe."""
-    min_shared: Count = 15
-    """Landmarks that two keyframes must share to be tied by them: no loop is needed."""
-    strong_shared: Count = 100
-    """Landmarks that they must share to hold each other in place when the path is corrected."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class News(NamedTuple):

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import Bundle, BundleConfig, BundleSolution, solve_bundle
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_inverse
-from odomap.limits import Count, Positive, check_limits
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.maps.snapshot import Snapshot, Update
@@ -29,25 +28,11 @@ from odomap.system.localmap import median_distance
 from odomap.system.ranging import UNIT_BASELINE
 from odomap.system.stages import Loop
 from odomap.system.uncertainty import Calibration, Drift, NoiseConfig
+from odomap.system.visualconfig import WindowConfig
 
 __all__ = ["WindowChange", "WindowConfig", "WindowJob", "WindowMapper"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class WindowConfig:
-    """The window of keyframes adjusted together."""
-
-    size: Count = 7
-    """Keyframes adjusted."""
-    fixed: Count = 2
-    """Older keyframes that hold them in place."""
-    gate: Positive = 3.5
-    """Residual, in standard deviations, beyond which an observation is dropped."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class WindowMapper:

@@ -18,7 +18,6 @@ sequences", T-RO 28(5), 2012; Mur-Artal, Montiel, Tardós, "ORB-SLAM", T-RO 2015
 """
 
 import logging
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.system.revisits import group_scores
+from odomap.system.visualconfig import PlacesConfig
 from odomap.vision.places import Places
 from odomap.vision.vocabulary import BagOfWords, VocabularyTree
 
@@ -40,15 +40,6 @@ GROUP = 6
 """Keyframes of a place: one and those that share most landmarks with it."""
 GROUP_SHARE = 0.3
 """Summed score of a place relative to that of the best one."""
-
-
-@dataclass(frozen=True)
-class PlacesConfig:
-    """By which words places are recognised."""
-
-    vocabulary: str = ""
-    """File of a vocabulary, as `odomap vocabulary train` writes it; none: that which comes with
-    odomap. A map holds no words: one made with another vocabulary gets them anew."""
 
 
 class PlaceIndex:

@@ -156,7 +156,10 @@ class Resection:
         if not result.converged or share < SPREAD:
             why = result.reason or f"all that agrees is in {100 * share:.0f} % of the image"
             return len(rows), why
-        most_seen = int(self._map.observing(ids)[0][0])
+        seen_by = self._map.observing(ids)[0]
+        if not len(seen_by):
+            return len(rows), "no keyframe shows what agrees any more"
+        most_seen = int(seen_by[0])
         return Recognised(result.T_world_camera.matrix, result.covariance, ids, rows, most_seen)
 
     def _too_few(self, agreed: int) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from odomap.lidar.scans import Beams, ScanPoints
 from odomap.sensors.frame import Frame
-from odomap.system.looking import Clock
+from odomap.system.clock import Clock
 
 __all__ = ["ScanView", "view_scan"]
 

@@ -32,11 +32,12 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.association import Association, TrackingConfig, View
+from odomap.system.clock import Clock
 from odomap.system.dispute import FEWEST, SETTLED
 from odomap.system.eye import Eye
 from odomap.system.keyframing import Keyframes
 from odomap.system.locating import Located
-from odomap.system.looking import Clock, Look, Looker, Unseen, doubt
+from odomap.system.looking import Look, Looker, Unseen, doubt
 from odomap.system.path import ASTRAY, Path, Placed
 from odomap.system.starting import Start, Started, Waiting
 from odomap.system.veil import VEILED, Veil

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from odomap.backend.bundle import BundleSolution
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_adjoint, se3_inverse, sim3_adjoint
-from odomap.limits import NotNegative, Positive, check_limits
+from odomap.system.visualconfig import NoiseConfig
 
 __all__ = ["Calibration", "Drift", "NoiseConfig"]
 
@@ -40,24 +40,6 @@ Array = NDArray[np.float64]
 
 LEAST_PARALLAX = 0.02
 """Radians; a camera that moves by less of the depth makes no landmarks that carry the scale on."""
-
-
-@dataclass(frozen=True)
-class NoiseConfig:
-    """How far what is measured may be off."""
-
-    position_px: Positive = 0.4
-    """Standard deviation of the position of a point followed by optical flow."""
-    feature_px: Positive = 0.45
-    """Standard deviation of the position of a feature found on the finest level of the pyramid."""
-    overlap: Positive = 4.0
-    """Factor on variances for errors that observations share: patches overlap, tracks go on."""
-    calibration_px: NotNegative = 0.15
-    """Standard deviation of the calibration: of disparities (offset, slopes), and of the camera's
-    direction on the body."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ Reference: Mur-Artal, Montiel, TardÃ³s, "ORB-SLAM", T-RO 2015, section IV; NistÃ
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ from odomap.geometry.twoview import (
     relative_pose,
     sampson_distance,
 )
-from odomap.limits import Fraction, Limits, NotNegative, Positive, check_limits
+from odomap.vision.visionconfig import BootstrapConfig
 
 __all__ = [
     "BetweenView",
@@ -52,23 +51,6 @@ VIEWS_BETWEEN = 3
 CLEARLY = 0.8
 """The right motion misses points by this fraction of what the wrong one does, or less. Of 300 noisy
 planes none was decided wrongly even at 0.95."""
-
-
-@dataclass(frozen=True)
-class BootstrapConfig:
-    """When two views of one camera are enough to start."""
-
-    min_parallax_px: NotNegative = 1.5
-    """Median displacement that no rotation explains; several times the noise of a point."""
-    min_points: Annotated[int, Limits(least=8)] = 60
-    """Points that must be triangulated, and matches needed to try."""
-    max_error_px: Positive = 1.5
-    """Largest distance of a match from its epipolar line, or of a point from where it was seen."""
-    max_ambiguity: Fraction = 0.85
-    """Another motion must explain less than this share of the points of the best."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,39 +16,16 @@ Reference: Khoshelham, Elberink, "Accuracy and Resolution of Kinect Depth Data f
 Applications", Sensors 2012.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import ConfigError, InputError
+from odomap.errors import InputError
 from odomap.kernels import kernel
-from odomap.limits import NotNegative, Positive, check_limits
+from odomap.vision.visionconfig import DepthConfig
 
 __all__ = ["DepthConfig", "inverse_depth_at", "warm_up"]
 
 Depth = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class DepthConfig:
-    """What a depth sensor knows."""
-
-    noise: Positive = 0.002
-    """Standard deviation of inverse depth, 1/m: 2 mm at 1 m, 3 cm at 4 m."""
-    calibration: NotNegative = 0.001
-    """How far all inverse depths may be off together, 1/m."""
-    nearest: Positive = 0.2
-    """Depth below this is not believed, metres."""
-    farthest: Positive = 8.0
-    """Depth beyond this is not believed, metres."""
-    edge: NotNegative = 0.06
-    """Pixels around a point whose depth differs by more than this fraction lie on two objects."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
-        if self.nearest >= self.farthest:
-            raise ConfigError(f"nearest: {self.nearest} must be below farthest, {self.farthest}")
 
 
 def inverse_depth_at(

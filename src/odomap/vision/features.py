@@ -13,14 +13,13 @@ high-speed corner detection", ECCV 2006.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.limits import Count, Limits, check_limits
+from odomap.vision.visionconfig import Detector, FeatureConfig
 
 __all__ = [
     "Corners",
@@ -35,24 +34,6 @@ __all__ = [
 ]
 
 Image = NDArray[np.uint8]
-Detector = Literal["fast", "harris", "orb", "sift"]
-
-
-@dataclass(frozen=True)
-class FeatureConfig:
-    """How corners are found."""
-
-    detector: Detector = "fast"
-    """Corner detector: fast, harris, orb or sift."""
-    count: Count = 300
-    """Features wanted per keyframe."""
-    threshold: Annotated[int, Limits(least=1, most=255)] = 12
-    """FAST contrast threshold, grey levels; halved once where too few corners pass."""
-    border_px: Annotated[int, Limits(least=0)] = 12
-    """Margin at the image border in which no feature is taken."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True)

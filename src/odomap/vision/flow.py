@@ -12,14 +12,12 @@ Reference: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracke
 Mikolajczyk, Matas, "Forward-Backward Error", ICPR 2010.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.limits import Correlation, Count, NotNegative, check_limits
 from odomap.vision.patches import PRECISION_PX, Flow, align_patches
+from odomap.vision.visionconfig import FlowConfig
 
 __all__ = ["FlowConfig", "facing_warp", "pyramid", "track"]
 
@@ -28,25 +26,6 @@ Points = NDArray[np.float64]
 
 COARSE_PRECISION_PX = 0.1
 """The same on coarse levels, whose answer the next finer one improves on."""
-
-
-@dataclass(frozen=True)
-class FlowConfig:
-    """How points are followed from image to image."""
-
-    half_window_px: Count = 6
-    """Half the patch side: 6 gives 13x13 pixels."""
-    levels: Count = 3
-    """Pyramid levels; each doubles the motion that can be followed."""
-    iterations: Count = 12
-    """Most Gauss-Newton steps per level."""
-    min_correlation: Correlation = 0.75
-    """Smallest normalised correlation of a patch with its template."""
-    max_backward_px: NotNegative = 0.7
-    """Largest distance between a point and where tracking it back ends; 0 leaves the check out."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def pyramid(image: Image, levels: int) -> tuple[Image, ...]:

@@ -15,14 +15,12 @@ Reference: Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJ
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.limits import Fraction, Limits, NotNegative, Positive, check_limits
 from odomap.vision.hamming import (
     CELL_PX,
     NO_DISTANCE,
@@ -32,6 +30,7 @@ from odomap.vision.hamming import (
     search_circles,
     search_epipolar,
 )
+from odomap.vision.visionconfig import MatchConfig
 
 __all__ = [
     "EpipolarView",
@@ -52,23 +51,6 @@ CHI2 = 3.84
 """Squared deviations of one degree of freedom that 95 % stay below."""
 EPIPOLE_SIGMAS = 10.0
 """Nearer to the epipole than this no line says where to search, and no depth follows."""
-
-
-@dataclass(frozen=True)
-class MatchConfig:
-    """How descriptors are matched."""
-
-    radius_px: Positive = 24.0
-    """Search radius around the expected position."""
-    ratio: Fraction = 0.85
-    """The best distance must be below this fraction of the second best."""
-    max_hamming: Annotated[int, Limits(least=0, most=256)] = 64
-    """Largest distance of binary descriptors, bits of 256."""
-    max_euclidean: NotNegative = 250.0
-    """Largest distance of SIFT descriptors."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def match_guided(

@@ -13,17 +13,15 @@ Reference: Rublee, Rabaud, Konolige, Bradski, "ORB: an efficient alternative to 
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.errors import ConfigError
 from odomap.kernels import kernel
-from odomap.limits import Count, Limits, check_limits
 from odomap.vision.brief import BORDER_PX, rotated_brief
 from odomap.vision.fast import fast_corners, refine
+from odomap.vision.visionconfig import OrbConfig
 
 __all__ = ["OrbConfig", "OrbFeatures", "describe_at", "extract", "warm_up"]
 
@@ -32,30 +30,6 @@ Image = NDArray[np.uint8]
 CELLS_PER_FEATURE = 0.25
 """Cells a level is divided into, per feature wanted: finer ones spread better, and take weaker
 corners."""
-
-
-@dataclass(frozen=True)
-class OrbConfig:
-    """How ORB features are found."""
-
-    count: Count = 1000
-    """Features wanted per image."""
-    levels: Annotated[int, Limits(least=1, most=16)] = 8
-    """Levels of the image pyramid."""
-    scale: Annotated[float, Limits(least=1.05, most=2)] = 1.2
-    """Size of a level relative to the one above it."""
-    threshold: Annotated[int, Limits(least=1, most=254)] = 20
-    """FAST contrast threshold, grey levels."""
-    least_threshold: Annotated[int, Limits(least=1, most=254)] = 7
-    """Threshold in cells where no corner passes the other."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
-        if self.least_threshold > self.threshold:
-            raise ConfigError(
-                f"least_threshold: {self.least_threshold} must be at most threshold, "
-                f"{self.threshold}"
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,16 +15,13 @@ Reference: Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual I
 locking).
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.limits import Correlation, Count, Fraction, NotNegative, Positive, check_limits
 from odomap.vision.patches import align_patches
+from odomap.vision.visionconfig import StereoConfig
 
 __all__ = ["StereoConfig", "match_sparse", "sgbm_disparity"]
 
@@ -32,31 +29,6 @@ Image = NDArray[np.uint8]
 
 MOST_HALF = 7
 """Sums over windows of up to this half side, 225 differences, go into 16 bits."""
-
-
-@dataclass(frozen=True)
-class StereoConfig:
-    """How disparities are measured."""
-
-    method: Literal["sparse", "sgbm"] = "sparse"
-    """sparse: sub-pixel matches of the features; sgbm: a dense map, looked up at the features."""
-    max_disparity_px: Count = 128
-    """Largest disparity searched; nearer points get no depth."""
-    half_search_px: Count = 4
-    """Half the side of the window in the search along the row."""
-    half_refine_px: Count = 4
-    """Half the side of the patch in the sub-pixel step."""
-    uniqueness: Fraction = 0.75
-    """The best score must be below this fraction of the best score elsewhere on the row."""
-    min_correlation: Correlation = 0.8
-    """Smallest normalised correlation of the two patches."""
-    max_vertical_px: NotNegative = 0.5
-    """Largest distance of a match from its row."""
-    noise_px: Positive = 0.8
-    """Standard deviation of a disparity."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def match_sparse(
