@@ -121,7 +121,7 @@ def test_a_scan_is_found_in_a_grid_that_was_saved(tmp_path):
     normals = np.concatenate([seen.normals, np.zeros_like(seen.between)])
     found = GridPyramid(loaded).search(points, np.zeros(3), 3.0, np.pi, 0.4)
     exact = match_to_grid(loaded, points, normals, found.x_grid_body)
-    assert np.hypot(*(exact.x_grid_body - true)[:2]) < 0.025  # half a cell
+    assert np.hypot(*(exact.x_grid_body - true)[:2]) < 0.035  # half the diagonal of a cell
     assert abs(np.angle(np.exp(1j * (exact.x_grid_body - true)[2]))) < 0.01  # a cell at 5 m
     assert exact.on_walls > 0.9
 
