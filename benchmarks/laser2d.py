@@ -42,6 +42,7 @@ from meter import machine
 
 from odomap.lidar.grid import OccupancyGrid
 from odomap.lidar.scans import Beams
+from odomap.run import chosen_config
 from odomap.simulation.laserworld import LaserSpec, LaserWorld
 
 RECORDED = ("intel", "csail", "loop5", "speed")
@@ -52,6 +53,7 @@ LARGEST_M, LARGEST_DEG = 0.0229, 0.453
 LARGEST_PERCENT, LEAST_TRUE = 0.3, 0.95
 LEAST_FACTOR, LARGEST_GROWTH = 40.0, 1.3
 GROWING = ("keyframes", "submaps", "edges", "file_mb", "memory_mb", "peak_mb")
+WITHOUT_THINNING = (("scan_thinning.enabled", "false"),)
 BUILDING = "sim:building?sensors=laser&seed={}"
 
 
@@ -241,8 +243,13 @@ def speed(bench: Bench) -> None:
 def memory(bench: Bench) -> None:
     """Go round one building again and again."""
     options = bench.options
-    world, thins = BUILDING.format(options.first_seed), not options.keep_all
-    held = runs.rounds_of(world, options.rounds, thins)
+    config = chosen_config("lidar2d", overrides=WITHOUT_THINNING if options.keep_all else ())
+    held = runs.rounds_of(BUILDING.format(options.first_seed), options.rounds, config)
+    tell_growth(bench, held, GROWING)
+
+
+def tell_growth(bench: Bench, held: list[runs.Held], growing: tuple[str, ...]) -> None:
+    """Show what is held after each round, and hold the last against the second."""
     print("round  keyframes  submaps  edges  file MB  memory MB  peak MB  lost  ATE mm  NEES    ms")
     for number, each in enumerate(held, 1):
         print(
@@ -252,7 +259,7 @@ def memory(bench: Bench) -> None:
             flush=True,
         )
     bench.numbers["memory"] = [asdict(each) for each in held]
-    for name in GROWING:
+    for name in growing:
         ratio = getattr(held[-1], name) / getattr(held[1], name)
         print(f"{name:12}{ratio:6.2f} times those after two rounds")
         sentence = f"memory: {ratio:.2f} times the {name}, at most {LARGEST_GROWTH}"

@@ -5,6 +5,7 @@ import multiprocessing
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +31,12 @@ from odomap.maps.occupancy import grid_of_map
 from odomap.run import RunResult, chosen_config, run
 from odomap.sources.open import open as open_source
 from odomap.sources.simulated import SimulatedSource
+from odomap.system.config import Config
 from odomap.system.slam import Slam
 from odomap.system.system import System
 
 WITHOUT_LOOPS = (("scan_closing.enabled", "false"),)
-WITHOUT_THINNING = (("scan_thinning.enabled", "false"),)
+Judge = Callable[[Trajectory, Trajectory], float]
 EVERY = 5
 """Of the frames of a world, those whose beams say which walls can be seen."""
 
@@ -124,14 +126,14 @@ class Held:
 
     Attributes:
         keyframes: alive.
-        submaps: likewise.
+        submaps: likewise; none but of a 2D laser.
         edges: of the map.
         file_mb: size of its file.
         memory_mb: of the process, over what it held before the first frame.
         peak_mb: the most it ever held, all in all.
         lost: frames of this round.
         ate_m: of the path so far.
-        nees: as of a building.
+        nees: mean normalised error squared per degree of freedom.
         ms: of a frame in this round, mean.
     """
 
@@ -259,16 +261,23 @@ def factor_of_real_time(file: Path) -> float:
     return float(metrics["duration_s"]) / seconds
 
 
-def rounds_of(name: str, rounds: int, thins: bool = True) -> list[Held]:
-    """Go round a world in a process of its own; return what is held after each round."""
+def rounds_of(name: str, rounds: int, config: Config, judge: Judge = planar_nees) -> list[Held]:
+    """Go round a world in a process of its own; return what is held after each round.
+
+    Args:
+        name: of the world.
+        rounds: how often.
+        config: of the system.
+        judge: says how large normalised errors are.
+    """
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        return pool.submit(_gone_round, f"{name}&rounds={rounds}", rounds, thins).result()
+        world = f"{name}&rounds={rounds}"
+        return pool.submit(_gone_round, world, rounds, config, judge).result()
 
 
-def _gone_round(name: str, rounds: int, thins: bool) -> list[Held]:
+def _gone_round(name: str, rounds: int, config: Config, judge: Judge) -> list[Held]:
     source = open_source(name)
-    config = chosen_config("lidar2d", overrides=() if thins else WITHOUT_THINNING)
     system = Slam(source.rig, config)
     for module in needed_modules():
         warm_up(module)
@@ -280,12 +289,14 @@ def _gone_round(name: str, rounds: int, thins: bool) -> list[Held]:
         if frame.id in ends:
             seconds = perf_counter() - start
             each = ends[0] if not held else ends[1] - ends[0]
-            held.append(_held(system, source, before, lost, 1e3 * seconds / each))
+            held.append(_held(system, source, before, lost, 1e3 * seconds / each, judge))
             lost, start = 0, perf_counter()
     return held
 
 
-def _held(system: System, source: SimulatedSource, before: float, lost: int, ms: float) -> Held:
+def _held(
+    system: System, source: SimulatedSource, before: float, lost: int, ms: float, judge: Judge
+) -> Held:
     """Look at a system between two frames."""
     memory = private_mb() - before
     with tempfile.TemporaryDirectory(prefix="odomap-laser2d-") as folder:
@@ -295,13 +306,13 @@ def _held(system: System, source: SimulatedSource, before: float, lost: int, ms:
     path = system.finish()
     return Held(
         path.map.num_keyframes,
-        path.mapping["submaps"],
+        path.mapping.get("submaps", 0),
         len(path.map.edges().kind),
         size,
         memory,
         peak_memory_mb(),
         lost,
         ate(path.trajectory, source.truth).rmse,
-        planar_nees(path.trajectory, source.truth),
+        judge(path.trajectory, source.truth),
         ms,
     )
