@@ -1,7 +1,7 @@
-"""The view of a run that is over: its map and its path, and the camera at any frame of it.
+"""The view of a run that is over: its map and its path, and the sensor at any frame of it.
 
 A run's folder holds the map (`map.odomap`) and the path (`trajectory.tum`); one of them is enough,
-and a map file alone will do, whose path is that of its keyframes. A slider moves the camera along
+and a map file alone will do, whose path is that of its keyframes. A slider moves the sensor along
 the path. Frames that were lost have no row in the path: where it pauses for much longer than from
 frame to frame, it is drawn as lost. Nothing is written, and no recording is opened.
 
@@ -9,7 +9,7 @@ Cost: O(map) once, then O(1) per look.
 """
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from odomap.errors import InputError
 from odomap.files.mapfile import SUFFIX, MapFile
 from odomap.files.trajectories import read_tum
-from odomap.geometry.camera import Camera
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.map import Map
-from odomap.viewing import distance_seen, serve, tracked_camera
-from odomap.views.livemap import LandmarkSample, Sketch, sketch
+from odomap.viewing import serve
+from odomap.views.livemap import Sketch, sketch
 from odomap.views.livescene import LiveScene, Panel
+from odomap.views.livesensor import CameraSensor, Sensor, tracked_sensor, usual_sensors
 from odomap.views.liveserver import HOST, PORT, close_server, open_server
 
 __all__ = ["PastRun", "review"]
@@ -32,8 +32,6 @@ __all__ = ["PastRun", "review"]
 Array = NDArray[np.float64]
 
 PATH_FILE, LIVE_FILE, MAP_FILE = "trajectory.tum", "trajectory_live.tum", "map.odomap"
-LANDMARKS = 100_000
-"""At most so many are shown: nothing else needs the machine."""
 PAUSE = 5.0
 """A path pauses where two of its frames are so many usual steps apart."""
 
@@ -47,15 +45,13 @@ class PastRun:
         trajectory: T_world_body of its frames, or of the keyframes where there is no path.
         map: what is remembered; an empty one where there is no map.
         told: (N, 3) the path as it was told frame by frame; none where nobody says.
-        camera: the camera that was tracked, None where nobody says.
-        T_body_camera: its mount.
+        sensor: that was followed; a camera of no known kind where nobody says.
     """
 
     name: str
     trajectory: Trajectory
     map: Map
-    camera: Camera | None
-    T_body_camera: SE3
+    sensor: Sensor
     told: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
@@ -74,15 +70,15 @@ class PastRun:
         has_map, has_path = is_map or map_file.is_file(), not is_map and path_file.is_file()
         if not (has_map or has_path):
             raise InputError(f"{place}: neither {MAP_FILE} nor {PATH_FILE} is there: is it a run?")
-        found, camera, T_body_camera = _map(map_file) if has_map else (Map(), None, SE3.identity())
+        found, sensor = _map(map_file) if has_map else (Map(), CameraSensor())
         trajectory = read_tum(path_file) if has_path else _keyframes(found)
         if not len(trajectory):
             raise InputError(f"{place}: there is no pose in it")
         live = place / LIVE_FILE
         told = read_tum(live) if has_path and live.is_file() else trajectory.rows(np.arange(0))
-        Ts = told.Ts_world_body @ T_body_camera.matrix
+        Ts = told.Ts_world_body @ sensor.T_body_sensor.matrix
         name = place.name or str(place)
-        return cls(name, trajectory, found, camera, T_body_camera, Ts[:, :3, 3])
+        return cls(name, trajectory, found, sensor, Ts[:, :3, 3])
 
 
 def review(path: str | Path, host: str = HOST, port: int = PORT) -> None:
@@ -100,13 +96,13 @@ def review(path: str | Path, host: str = HOST, port: int = PORT) -> None:
     server, url = open_server(host, port)
     try:
         print(f"odomap: view: {url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
-        serve(Review(past, LiveScene(server, past.camera, len(past.trajectory))).go_on)
+        serve(Review(past, LiveScene(server, past.sensor, len(past.trajectory))).go_on)
     finally:
         close_server(server)
 
 
 class Review:
-    """Draws a past run, and its camera where the slider is.
+    """Draws a past run, and its sensor where the slider is.
 
     Args:
         past: the run.
@@ -115,17 +111,16 @@ class Review:
 
     def __init__(self, past: PastRun, scene: LiveScene) -> None:
         self._past, self._scene, self._frame = past, scene, -1
-        self._Ts = past.trajectory.Ts_world_body @ past.T_body_camera.matrix
-        sample = LandmarkSample(LANDMARKS)
-        sample.add(past.map.landmark_ids)
-        seen = sketch(past.map, sample, past.T_body_camera.t)
+        T_body_sensor = past.sensor.T_body_sensor
+        self._Ts = past.trajectory.Ts_world_body @ T_body_sensor.matrix
+        seen = sketch(past.map, past.sensor.whole(past.map), T_body_sensor.t)
         self._counts: tuple[tuple[str, str], ...] = (
             ("keyframes", str(len(seen.Ts_world_body))),
-            ("landmarks", str(seen.num_landmarks)),
+            (past.sensor.remembers, str(seen.shown.count)),
         )
         scene.face(self._Ts[0], self._reach(seen))
-        nowhere = np.zeros(len(seen.points), np.bool_)
-        scene.show_map(seen.points, nowhere, seen.Ts_world_body @ past.T_body_camera.matrix)
+        unseen = replace(seen.shown, is_seen=np.zeros(len(seen.shown.points), np.bool_))
+        scene.show_map(unseen, seen.Ts_world_body @ T_body_sensor.matrix)
         scene.show_path(self._Ts[:, :3, 3], pauses(past.trajectory.stamps_ns))
         told = past.told if len(seen.loops) else past.told[:0]
         scene.show_loops(seen.loops, seen.gaps, told)
@@ -133,11 +128,11 @@ class Review:
             self._counts += (("loops", str(len(seen.loops))),)
 
     def go_on(self) -> None:
-        """Look where the slider is, and draw the camera there."""
+        """Look where the slider is, and draw the sensor there."""
         if self._scene.frame != self._frame:
             self._frame = self._scene.frame
             pose = SE3(self._Ts[self._frame])
-            self._scene.show_camera(pose.matrix, pose.quaternion, None, False)
+            self._scene.show_sensor(pose.matrix, pose.quaternion, None, False)
             stamp = f"{1e-9 * self._past.trajectory.stamps_ns[self._frame]:.3f} s"
             where = f"{self._frame + 1} of {len(self._Ts)}"
             rows = (("frame", where), ("time", stamp), *self._counts)
@@ -146,8 +141,8 @@ class Review:
         self._scene.obey()
 
     def _reach(self, seen: Sketch) -> float:
-        """Return how far the camera sees, or a share of the path's size where that is unknown."""
-        reach = distance_seen(seen, self._past.T_body_camera)
+        """Return how far the sensor sees, or a share of the path's size where that is unknown."""
+        reach = seen.distance_seen(self._past.sensor.T_body_sensor.t)
         extent = float(np.linalg.norm(np.ptp(self._Ts[:, :3, 3], axis=0)))
         return reach or 0.2 * extent or 1.0
 
@@ -161,18 +156,16 @@ def pauses(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return is_last
 
 
-def _map(path: Path) -> tuple[Map, Camera | None, SE3]:
+def _map(path: Path) -> tuple[Map, Sensor]:
     with MapFile(path) as file:
         rig = file.rig
-        if rig is None or not rig.cameras:
-            return file.map(), None, SE3.identity()
-        usual = "rgbd" if rig.depth is not None else "stereo" if len(rig.cameras) > 1 else "mono"
-        said = file.settings.get("sensors", usual)
+        if rig is None:
+            return file.map(), CameraSensor()
+        said = str(file.settings.get("sensors", usual_sensors(rig)))
         try:
-            _, mount, T_body_camera = tracked_camera(rig, str(said))
+            return file.map(), tracked_sensor(rig, said)
         except InputError:  # cameras that are no pair: the first one was tracked
-            _, mount, T_body_camera = tracked_camera(rig, "mono")
-        return file.map(), mount.camera, T_body_camera
+            return file.map(), tracked_sensor(rig, "mono")
 
 
 def _keyframes(map: Map) -> Trajectory:

@@ -31,11 +31,11 @@ from odomap.maps.estimate import Estimate, Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
-from odomap.sensors.rig import CameraMount, Rig
+from odomap.sensors.rig import Rig
 from odomap.system.feed import Mailbox
-from odomap.views.livemap import LandmarkSample, LivePath, Sketch, sketch
-from odomap.views.livepicture import picture
+from odomap.views.livemap import LivePath, sketch
 from odomap.views.livescene import LiveScene, Panel
+from odomap.views.livesensor import Sensor, tracked_sensor
 from odomap.views.liveserver import HOST, PORT, check_viewer, close_server, open_server
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from odomap.system.stages import Loop, MapState
     from odomap.system.worker import Worker
 
-__all__ = ["View", "check_view", "serve", "tracked_camera", "watching"]
+__all__ = ["View", "check_view", "serve", "watching"]
 
 Array = NDArray[np.float64]
 
@@ -59,8 +59,6 @@ NEWS_FOR_S = 20.0
 """What has just happened is said for so long."""
 PATIENCE_S = 5.0
 """How long drawing may take when it is no longer wanted."""
-ENOUGH = 20
-"""Landmarks in sight that tell how far a camera sees."""
 
 
 class Watched(Protocol):
@@ -103,12 +101,12 @@ class View:
         Args:
             system: a SLAM system or odometry.
             rig: of its frames.
-            config: its configuration, which says the cameras that it tracks.
+            config: its configuration, which says the sensors that it tracks.
         """
         self._stop()
         sensors = config.tracking.sensors
         unit = "units" if sensors == "mono" else "m"
-        self._drawing = _Drawing(self._server, system.map, *tracked_camera(rig, sensors), unit)
+        self._drawing = _Drawing(self._server, system.map, tracked_sensor(rig, sensors), unit)
         self._frames: tuple[Frame, ...] = ()
         worker = system.worker
         worker.on_estimate.append(self._on_estimate)
@@ -178,24 +176,15 @@ class View:
 class _Drawing:
     """What is known of a run, and drawn from."""
 
-    def __init__(
-        self,
-        server: Any,
-        map: Map,
-        index: int,
-        mount: CameraMount,
-        T_body_camera: SE3,
-        unit: str = "m",
-    ) -> None:
+    def __init__(self, server: Any, map: Map, sensor: Sensor, unit: str = "m") -> None:
         self.is_stale = True
         self.closed: list[Loop] = []
         self._unit, self._news_s, self._num_told = unit, -np.inf, 0
-        self._map, self._index, self._T_body_camera = map, index, T_body_camera
+        self._map, self._sensor, self._T_body_sensor = map, sensor, sensor.T_body_sensor
         self._mailbox: Mailbox[Estimate] = Mailbox(MESSAGES)
-        self._scene = LiveScene(server, mount.camera)
-        self._path = LivePath(T_body_camera.t)
-        self._sample = LandmarkSample()
-        self._sample.add(map.landmark_ids)  # of a map that is gone on with
+        self._scene = LiveScene(server, sensor)
+        self._path = LivePath(self._T_body_sensor.t)
+        self._sample = sensor.sample(map)
         self._latest: tuple[Estimate, Frame | None] | None = None
         self._first: SE3 | None = None
         self._drawn: Estimate | None = None
@@ -204,7 +193,7 @@ class _Drawing:
         self._is_facing = False
         self._tail: list[Array] = []
         self._laps: deque[float] = deque(maxlen=30)
-        self._num_landmarks = self._num_keyframes = self._num_loops = 0
+        self._num_points = self._num_keyframes = self._num_loops = 0
 
     def tell(self, estimate: Estimate, frame: Frame | None) -> None:
         """Take note of an estimate; from the tracker's thread."""
@@ -228,22 +217,24 @@ class _Drawing:
         self._laps.append(sum(estimate.timing.values()))
         if estimate.keyframe_id < 0:
             return
-        T_world_camera = estimate.T_world_body @ self._T_body_camera
+        T_world_sensor = estimate.T_world_body @ self._T_body_sensor
         if self._first is None:
-            self._first = T_world_camera
-        self._tail.append(T_world_camera.t)
+            self._first = T_world_sensor
+        self._tail.append(T_world_sensor.t)
         self._tail = self._tail[-MESSAGES:]
 
     def _show_map(self) -> None:
-        seen = sketch(self._map, self._sample, self._T_body_camera.t)
-        self._num_landmarks, self._num_keyframes = seen.num_landmarks, len(seen.Ts_world_body)
+        seen = sketch(self._map, self._sample, self._T_body_sensor.t)
+        if not self._sample.is_whole:
+            self.is_stale = True
+        self._num_points, self._num_keyframes = seen.shown.count, len(seen.Ts_world_body)
         if not self._is_facing and self._first is not None:
-            reach = distance_seen(seen, self._T_body_camera)
+            reach = seen.distance_seen(self._T_body_sensor.t)
             if reach is not None:
                 self._is_facing = True
                 self._scene.face(self._first.matrix, reach)
-        Ts_world_camera = seen.Ts_world_body @ self._T_body_camera.matrix
-        self._scene.show_map(seen.points, seen.is_seen, Ts_world_camera)
+        Ts_world_sensor = seen.Ts_world_body @ self._T_body_sensor.matrix
+        self._scene.show_map(seen.shown, Ts_world_sensor)
         positions, is_lost = self._path.positions(self._map)
         self._scene.show_path(positions, is_lost)
         told = self._path.told if self.closed else positions[:0]
@@ -255,23 +246,21 @@ class _Drawing:
         if self._latest is None:
             return
         estimate, frame = self._latest
-        T_world_camera = estimate.T_world_body @ self._T_body_camera
+        T_world_sensor = estimate.T_world_body @ self._T_body_sensor
         panel = self._panel(estimate, now_s)
         if panel != self._said:
             self._said = panel
             self._scene.say(panel)
         if estimate is not self._drawn:
             self._drawn = estimate
-            images = () if frame is None else frame.images
-            raw = images[self._index] if self._index < len(images) else None
-            shown = None if raw is None else picture(raw, estimate.tracks)
+            sight = None if frame is None else self._sensor.sight(frame, estimate)
             is_lost = estimate.status == Status.LOST
-            self._scene.show_camera(
-                T_world_camera.matrix, T_world_camera.quaternion, shown, is_lost
+            self._scene.show_sensor(
+                T_world_sensor.matrix, T_world_sensor.quaternion, sight, is_lost
             )
             if len(self._tail) > 1:
                 self._scene.show_tail(np.array(self._tail))
-        self._scene.follow(T_world_camera.matrix)
+        self._scene.follow(T_world_sensor.matrix)
 
     def _panel(self, estimate: Estimate, now_s: float) -> Panel:
         rows = [("frame", str(estimate.frame_id))]
@@ -279,7 +268,7 @@ class _Drawing:
             rows.append(("ms per frame", f"{np.median(self._laps):.1f}"))
         rows.append(("inliers", str(estimate.num_inliers)))
         rows.append(("keyframes", str(self._num_keyframes)))
-        rows.append(("landmarks", str(self._num_landmarks)))
+        rows.append((self._sensor.remembers, str(self._num_points)))
         if self._num_loops:
             rows.append(("loops", str(self._num_loops)))
         return Panel(estimate.status.value, estimate.reason, tuple(rows), self._news(now_s))
@@ -296,30 +285,6 @@ class _Drawing:
             f"{what}: keyframe {loop.keyframe_id} is back at {loop.matched_id}, path moved by "
             f"{loop.moved:.2g} {self._unit}"
         )
-
-
-def tracked_camera(rig: Rig, sensors: str) -> tuple[int, CameraMount, SE3]:
-    """Return which image of a frame is tracked, its camera, and T_body_camera of the poses.
-
-    Args:
-        rig: what there is.
-        sensors: what of it is used: stereo, rgbd or mono.
-    """
-    if sensors == "stereo":
-        mount = rig.stereo_pair()[0]
-    elif sensors == "rgbd" and rig.depth is not None:
-        mount = rig.camera(rig.depth.camera)
-    else:  # one camera is the body: without a scale its path cannot carry the lever arm
-        return 0, rig.cameras[0], SE3.identity()
-    return rig.cameras.index(mount), mount, mount.T_body_camera
-
-
-def distance_seen(seen: Sketch, T_body_camera: SE3) -> float | None:
-    """Return how far the newest keyframe sees, world units; None where it sees too little."""
-    if seen.is_seen.sum() < ENOUGH or not len(seen.Ts_world_body):
-        return None
-    eye = (seen.Ts_world_body[-1] @ T_body_camera.matrix)[:3, 3]
-    return float(np.median(np.linalg.norm(seen.points[seen.is_seen] - eye, axis=1)))
 
 
 def serve(go_on: Callable[[], object]) -> None:

@@ -1,8 +1,9 @@
 """A synthetic run: a noisy path around a room, its estimates, and a procedural picture."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse
 from odomap.geometry.pose import SE3
 from odomap.geometry.trajectory import Trajectory
 from odomap.maps.estimate import Estimate, Status, Tracks
+from odomap.viewing import View
 from odomap.views.covisibility import MapView
+from odomap.views.liveserver import close_server, open_server
 from odomap.views.record import Growth, Report, Sample
 
 START_NS = 1_403_636_579_763_555_584
@@ -169,3 +172,25 @@ def report() -> Report:
     assert run.points is not None
     counts = {"landmarks_created": 15321, "keyframes_culled": 9}
     return replace(run, map=map_view(run.points), growth=growth(run.estimates), mapping=counts)
+
+
+@pytest.fixture
+def viser() -> object:
+    """The server of pages, or a test that is skipped."""
+    return pytest.importorskip("viser", reason="the live view needs viser")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Any]:
+    """A server of pages, without a run."""
+    pytest.importorskip("viser", reason="the live view needs viser")
+    server, _ = open_server(port=8500)
+    yield server
+    close_server(server)
+
+
+@pytest.fixture
+def view(viser: object) -> Iterator[View]:
+    """A page."""
+    with View(port=8600) as view:
+        yield view

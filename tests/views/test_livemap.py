@@ -53,17 +53,17 @@ def test_a_sketch_shows_what_is_there():
     sample = LandmarkSample()
     seen = sketch(map, sample)
     assert np.array_equal(sample.ids, map.landmark_ids)
-    assert np.array_equal(seen.points, map.points_world(map.landmark_ids))
-    assert np.array_equal(seen.is_seen, np.arange(150) >= 100)  # by the newest keyframe
+    assert np.array_equal(seen.shown.points, map.points_world(map.landmark_ids))
+    assert np.array_equal(seen.shown.is_seen, np.arange(150) >= 100)  # by the newest keyframe
     assert np.array_equal(seen.Ts_world_body, map.Ts_world_body(map.keyframe_ids))
-    assert seen.num_landmarks == 150
+    assert seen.shown.count == 150
 
 
 def test_an_empty_map_is_an_empty_sketch():
     seen = sketch(Map(), LandmarkSample())
-    assert seen.points.shape == (0, 3)
+    assert seen.shown.points.shape == (0, 3)
     assert seen.Ts_world_body.shape == (0, 4, 4)
-    assert seen.num_landmarks == 0
+    assert seen.shown.count == 0
 
 
 def test_landmarks_that_go_and_fuse_leave_the_sample():
@@ -74,8 +74,8 @@ def test_landmarks_that_go_and_fuse_leave_the_sample():
     map.fuse_landmarks([10], [11])
     seen = sketch(map, sample)
     assert np.array_equal(sample.ids, map.landmark_ids)
-    assert len(seen.points) == 147
-    assert np.isfinite(seen.points).all()
+    assert len(seen.shown.points) == 147
+    assert np.isfinite(seen.shown.points).all()
 
 
 def test_a_sample_is_limited_spread_and_steady():
@@ -100,7 +100,7 @@ def test_the_lock_is_asked_for_little_at_a_time():
     ids = map.add_landmarks(0, np.random.default_rng(0).normal(size=(3 * CHUNK, 3)))
     map.add_observations(0, ids, np.full(len(ids), -1))
     seen = sketch(map, LandmarkSample())
-    assert len(seen.points) == 3 * CHUNK
+    assert len(seen.shown.points) == 3 * CHUNK
     assert max(map.asked) <= CHUNK
 
 

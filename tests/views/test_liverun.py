@@ -22,18 +22,12 @@ from odomap.sources.open import open as open_source
 from odomap.system.config import preset
 from odomap.system.odometry import make_odometry
 from odomap.system.stages import Loop
-from odomap.viewing import View
 from odomap.views.livescene import LiveScene
 from odomap.views.liveserver import close_server, open_server
 from recordings import Rendered
 
 WORLD = "sim:room?seed=3&frames=12&resolution=400x250"
 FILES = ("trajectory.tum", "trajectory_live.tum", "keyframes.tum", "map.odomap", "config.yaml")
-
-
-@pytest.fixture
-def viser():
-    return pytest.importorskip("viser", reason="the live view needs viser")
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +38,6 @@ def world():
 @pytest.fixture(scope="module")
 def plain(world, tmp_path_factory):
     return run(world, tmp_path_factory.mktemp("plain"))
-
-
-@pytest.fixture
-def view(viser):
-    with View(port=8600) as view:
-        yield view
 
 
 def drawing(view):
@@ -108,8 +96,8 @@ def test_whoever_comes_late_sees_the_whole_run(view, world):
     assert len(scene._keyframes.points) == 8 * found.map.num_keyframes
     assert sum(len(n.points) for n in scene._points.values()) == found.map.num_landmarks
     np.testing.assert_allclose(
-        scene._camera.position,
-        (last.T_world_body.matrix @ drawing(view)._T_body_camera.matrix)[:3, 3],
+        scene.figure.node.position,
+        (last.T_world_body.matrix @ drawing(view)._T_body_sensor.matrix)[:3, 3],
     )
     words = scene._words.content
     for word in (last.status.value, str(last.frame_id), str(found.map.num_landmarks)):
@@ -232,7 +220,7 @@ def test_a_past_run_is_what_the_run_left(plain, tmp_path):
     past = PastRun.read(plain.out)
     assert len(past.trajectory) == len(plain.trajectory)
     assert past.map.num_landmarks == plain.map.num_landmarks
-    assert past.camera is not None
+    assert past.sensor.camera is not None
     alone = PastRun.read(plain.out / "map.odomap")
     assert len(alone.trajectory) == plain.map.num_keyframes
     (tmp_path / "trajectory.tum").write_bytes((plain.out / "trajectory.tum").read_bytes())
@@ -252,7 +240,7 @@ def test_a_past_run_with_loops_has_the_path_before_them(plain, tmp_path, viser):
     assert len(past.told) == len(plain.trajectory_live)
     server, _ = open_server(port=8900)
     try:
-        scene = LiveScene(server, past.camera, len(past.trajectory))
+        scene = LiveScene(server, past.sensor, len(past.trajectory))
         Review(past, scene).go_on()
         assert len(scene._loops.points) == 1
         assert len(scene._told.points) == len(past.told) - 1
@@ -293,8 +281,8 @@ def test_a_past_run_is_shown_until_ctrl_c(viser, plain, monkeypatch, capsys):
     review(plain.out, port=8800)
     (shown,) = looks
     assert shown._frame == 5
-    T = plain.trajectory.Ts_world_body[5] @ shown._past.T_body_camera.matrix
-    np.testing.assert_allclose(shown._scene._camera.position, T[:3, 3], atol=1e-8)
+    T = plain.trajectory.Ts_world_body[5] @ shown._past.sensor.T_body_sensor.matrix
+    np.testing.assert_allclose(shown._scene.figure.node.position, T[:3, 3], atol=1e-8)
     assert "6 of 12" in shown._scene._words.content
     assert "http://127.0.0.1:88" in capsys.readouterr().err
 

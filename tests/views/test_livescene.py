@@ -6,30 +6,23 @@ import pytest
 from odomap.geometry.camera import Camera
 from odomap.geometry.lie import se3_exp
 from odomap.geometry.pose import SE3
+from odomap.views.livefigure import frusta
+from odomap.views.livemap import Shown
 from odomap.views.livescene import (
     KEYFRAMES,
     PATH_POINTS,
     LiveScene,
     Panel,
-    frusta,
     panel_html,
 )
-from odomap.views.liveserver import close_server, open_server
+from odomap.views.livesensor import CameraSensor
 
 CAMERA = Camera("pinhole", np.array([400.0, 400.0, 320.0, 240.0]), np.zeros(0), (640, 480))
 
 
-@pytest.fixture(scope="module")
-def server():
-    pytest.importorskip("viser", reason="the live view needs viser")
-    server, _ = open_server(port=8500)
-    yield server
-    close_server(server)
-
-
 @pytest.fixture
 def scene(server):
-    return LiveScene(server, CAMERA)
+    return LiveScene(server, CameraSensor(CAMERA))
 
 
 def test_frusta_are_cameras_that_look_ahead():
@@ -74,7 +67,7 @@ def test_a_path_that_has_not_begun(scene, n):
 def test_landmarks_in_sight_stand_out_and_keyframes_are_limited(scene):
     points = np.arange(12.0).reshape(4, 3)
     Ts = np.tile(np.eye(4), (KEYFRAMES + 500, 1, 1))
-    scene.show_map(points, np.array([False, True, False, True]), Ts)
+    scene.show_map(Shown(points, np.array([False, True, False, True]), 4), Ts)
     assert np.array_equal(scene._points[True].points, points[[1, 3]].astype(np.float32))
     assert np.array_equal(scene._points[False].points, points[[0, 2]].astype(np.float32))
     assert len(scene._keyframes.points) == 8 * KEYFRAMES
@@ -101,12 +94,12 @@ def test_following_moves_the_world_until_it_is_switched_off(scene):
 
 def test_the_camera_shows_the_newest_image(scene):
     image = np.zeros((480, 640, 3), np.uint8)
-    scene.show_camera(np.eye(4), np.array([1.0, 0, 0, 0]), image, False)
-    assert scene._camera.visible
-    assert scene._camera.image.shape == (240, 320, 3)
-    assert scene._picture.image.shape == (480, 640, 3)
-    scene.show_camera(np.eye(4), np.array([1.0, 0, 0, 0]), None, True)
-    assert scene._camera.image.shape == (240, 320, 3)
+    scene.show_sensor(np.eye(4), np.array([1.0, 0, 0, 0]), image, False)
+    assert scene.figure.node.visible
+    assert scene.figure.node.image.shape == (240, 320, 3)
+    assert scene.figure._picture.image.shape == (480, 640, 3)
+    scene.show_sensor(np.eye(4), np.array([1.0, 0, 0, 0]), None, True)
+    assert scene.figure.node.image.shape == (240, 320, 3)
 
 
 def test_controls_are_obeyed(scene):
@@ -121,12 +114,12 @@ def test_controls_are_obeyed(scene):
 
 
 def test_a_slider_tells_the_frame(server):
-    assert LiveScene(server, CAMERA).frame == 0
-    scene = LiveScene(server, None, frames=7)
+    assert LiveScene(server, CameraSensor(CAMERA)).frame == 0
+    scene = LiveScene(server, CameraSensor(), frames=7)
     assert scene.frame == 6
     scene._slider.value = 2
     assert scene.frame == 2
-    assert LiveScene(server, None, frames=1).frame == 0
+    assert LiveScene(server, CameraSensor(), frames=1).frame == 0
 
 
 def test_the_panel_escapes_what_is_not_ours():

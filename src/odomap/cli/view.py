@@ -11,7 +11,7 @@ __all__ = ["ViewVerb"]
 
 @dataclass(frozen=True)
 class ViewVerb:
-    """Show a run that is over in the browser: path, map, and the camera at any frame.
+    """Show a run that is over in the browser: path, map, and the sensor at any frame.
 
     `odomap run DATA --view` shows one while it goes on. Needs viser: pip install 'odomap[view]'.
     """

@@ -21,6 +21,7 @@ from odomap.views.gridpicture import (
     draw_path,
     draw_scale,
 )
+from odomap.views.ground import above_ground
 
 if TYPE_CHECKING:
     from odomap.maps.cloudmap import CloudMap
@@ -35,8 +36,6 @@ LOW, HIGH = (214, 221, 226), (24, 52, 84)
 """Colours of the ground and of what stands highest."""
 TALL = 6.0
 """Height above the ground from which on it is all the same, metres."""
-GROUND = 8.0
-"""Side of the squares in which the ground is looked for, metres."""
 FINEST = 0.1
 """Least size of a pixel, metres."""
 LONGEST = 1600
@@ -62,26 +61,11 @@ def cloud_picture(cloud: "CloudMap") -> Image:
     width, height = (np.ceil((high - low) / metre).astype(int) + 1).tolist()
     columns, rows = ((points[:, :2] - low) / metre).astype(np.int64).T
     is_in = (points[:, :2] >= low).all(1) & (columns < width) & (rows < height)
-    columns, rows, z = columns[is_in], rows[is_in], points[is_in, 2]
-    above = z - _ground(columns, rows, z, round(GROUND / metre) or 1, (height, width))
+    columns, rows = columns[is_in], rows[is_in]
+    above = above_ground(points[is_in])
     tall = np.full(height * width, -1.0)
     np.maximum.at(tall, rows * width + columns, np.clip(above / TALL, 0.0, 1.0))
     return _drawn(tall.reshape(height, width)[::-1], cloud.path, low, metre)
-
-
-def _ground(
-    columns: NDArray[np.int64], rows: NDArray[np.int64], z: Array, side: int, shape: tuple[int, int]
-) -> Array:
-    """Return the height of the ground below each point: low points of the square that it is in."""
-    wide = shape[1] // side + 1
-    square = rows // side * wide + columns // side
-    order = np.lexsort((z, square))
-    starts = np.flatnonzero(np.diff(square[order], prepend=-1))
-    counts = np.diff(starts, append=len(order))
-    lowest = z[order[starts + counts // 20]]
-    found = np.zeros(wide * (shape[0] // side + 1))
-    found[square[order[starts]]] = lowest
-    return np.asarray(found[square])
 
 
 def _drawn(tall: Array, path: Array, low: Array, metre: float) -> Image:

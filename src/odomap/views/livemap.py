@@ -3,9 +3,10 @@
 A picture needs neither every landmark nor all of them at one instant. So a sample is kept, the ids
 divisible by a power of two that grows with the map: a landmark that is shown stays shown. Its ids
 come from the newest keyframes, its places are asked for by the thousand, each time with the lock
-held for a fraction of a millisecond, whatever the size of the map. The path is kept as it hangs
-from keyframes, p_world = S_keyframe p_keyframe, so that it moves with them when a loop closes, and
-as it was told frame by frame, which shows from where it moved.
+held for a fraction of a millisecond, whatever the size of the map. (What LiDARs saw is sampled by
+`views.livecloud`.) The path is kept as it hangs from keyframes, p_world = S_keyframe p_keyframe, so
+that it moves with them when a loop closes, and as it was told frame by frame, which shows from
+where it moved.
 
 Reading O(sample + keyframes + frames), lock O(CHUNK).
 
@@ -14,6 +15,7 @@ system, 2015 (what hangs from what).
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ from odomap.maps.estimate import Estimate, Status
 from odomap.maps.map import Map
 from odomap.views.loopview import gap_ends, loop_ends
 
-__all__ = ["LandmarkSample", "LivePath", "Sketch", "sketch"]
+__all__ = ["LandmarkSample", "LivePath", "Sample", "Shown", "Sketch", "sketch"]
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -34,6 +36,25 @@ CHUNK = 2048
 """Rows asked for while the lock is held once."""
 NEWEST = 10
 """Keyframes asked again for what they see: mapping goes on around them."""
+ENOUGH = 20
+"""Points in sight that tell how far a sensor sees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Points of a map that are drawn.
+
+    Attributes:
+        points: (M, 3) in the world.
+        is_seen: (M,) whether the newest keyframe sees them.
+        count: how many there are, shown or not.
+        colours: (M, 3) uint8 of each, None where they are all alike.
+    """
+
+    points: Array
+    is_seen: NDArray[np.bool_]
+    count: int
+    colours: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,20 +62,42 @@ class Sketch:
     """What of a map is drawn.
 
     Attributes:
-        points: (M, 3) landmarks in the world.
-        is_seen: (M,) whether the newest keyframe sees them.
+        shown: its points.
         Ts_world_body: (K, 4, 4) of the living keyframes.
-        num_landmarks: how many there are, shown or not.
         loops: (L, 2, 3) ends of loops that were closed.
         gaps: (G, 2, 3) keyframes between which nothing was measured.
     """
 
-    points: Array
-    is_seen: NDArray[np.bool_]
+    shown: Shown
     Ts_world_body: Array
-    num_landmarks: int
     loops: Array
     gaps: Array
+
+    def distance_seen(self, t_body_sensor: Array) -> float | None:
+        """Return how far the newest keyframe sees, world units; None where it sees too little."""
+        seen = self.shown.points[self.shown.is_seen]
+        if len(seen) < ENOUGH or not len(self.Ts_world_body):
+            return None
+        T = self.Ts_world_body[-1]
+        eye = T[:3, :3] @ t_body_sensor + T[:3, 3]
+        return float(np.median(np.linalg.norm(seen - eye, axis=1)))
+
+
+class Sample(Protocol):
+    """Some of what a map remembers, spread evenly."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the last look has read all that there was."""
+
+    def look(self, map: Map, keyframe_ids: Ids, Ts_world_body: Array) -> Shown:
+        """Read what is new, and return what is shown.
+
+        Args:
+            map: may change meanwhile.
+            keyframe_ids: (K,) its living keyframes, in order.
+            Ts_world_body: (K, 4, 4) where they are.
+        """
 
 
 class LandmarkSample:
@@ -65,11 +108,22 @@ class LandmarkSample:
 
     Attributes:
         ids: (N,) those in the sample, ascending.
+        is_whole: whether the last look has read all that there was, which it always has.
     """
 
     def __init__(self, limit: int = LANDMARKS) -> None:
         self.ids = np.zeros(0, np.int64)
         self._limit, self._stride = limit, 1
+        self.is_whole = True
+
+    def look(self, map: Map, keyframe_ids: Ids, Ts_world_body: Array) -> Shown:
+        """Return the sample; landmarks that the newest keyframes see join it."""
+        seen = np.zeros(0, np.int64)
+        for k in keyframe_ids[-NEWEST:].tolist():
+            seen, _ = map.observations_of(k)
+            self.add(seen)
+        points = self.places(map)
+        return Shown(points, np.isin(self.ids, seen), map.num_landmarks)
 
     def add(self, ids: Ids) -> None:
         """Take (N,) ids into account."""
@@ -99,11 +153,11 @@ class LivePath:
     """The frames so far, by the keyframes they hang from.
 
     Args:
-        t_body_camera: (3,) the point on the body whose path it is.
+        t_body_sensor: (3,) the point on the body whose path it is.
     """
 
-    def __init__(self, t_body_camera: Array) -> None:
-        self._t = t_body_camera
+    def __init__(self, t_body_sensor: Array) -> None:
+        self._t = t_body_sensor
         self._rows = 0
         self._keyframe = np.zeros(0, np.int64)
         self._place = np.zeros((0, 3))
@@ -147,30 +201,20 @@ class LivePath:
         return Ts[:, :3, 3] + scales[:, None] * turned, is_lost
 
 
-def sketch(map: Map, sample: LandmarkSample, t_body_camera: Array | None = None) -> Sketch:
+def sketch(map: Map, sample: Sample, t_body_sensor: Array | None = None) -> Sketch:
     """Read what is drawn of a map, a little at a time.
 
     Args:
         map: may change meanwhile; then a part is of before, another of after.
-        sample: the landmarks wanted; those that the newest keyframes see join it.
-        t_body_camera: (3,) the point on the body that loops are drawn at; default its origin.
+        sample: the points wanted.
+        t_body_sensor: (3,) the point on the body that loops are drawn at; default its origin.
     """
-    keyframes = map.keyframe_ids
-    seen = np.zeros(0, np.int64)
-    for k in keyframes[-NEWEST:].tolist():
-        seen, _ = map.observations_of(k)
-        sample.add(seen)
-    points = sample.places(map)
-    is_seen = np.isin(sample.ids, seen)
-    Ts = [map.Ts_world_body(chunk) for chunk in _chunks(keyframes)]
-    return Sketch(
-        points,
-        is_seen,
-        np.concatenate([np.zeros((0, 4, 4)), *Ts]),
-        map.num_landmarks,
-        loop_ends(map, t_body_camera),
-        gap_ends(map, t_body_camera),
+    ids = map.keyframe_ids
+    Ts = np.concatenate(
+        [np.zeros((0, 4, 4)), *(map.Ts_world_body(chunk) for chunk in _chunks(ids))]
     )
+    shown = sample.look(map, ids, Ts)
+    return Sketch(shown, Ts, loop_ends(map, t_body_sensor), gap_ends(map, t_body_sensor))
 
 
 def _chunks(ids: Ids) -> list[Ids]:

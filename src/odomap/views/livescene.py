@@ -1,10 +1,10 @@
-"""The scene of the live view: path, landmarks, keyframes, camera, and a panel beside them.
+"""The scene of the live view: path, map, keyframes, sensor, and a panel beside them.
 
 The world of a run knows no up, since nobody told it of gravity; but cameras are seldom upside down.
-So up is what was up in the first image (y points down there), and the first look is from behind and
-above the first camera, as far away as what it sees. Lines are a few pixels thick, whatever the
-scale. Everything of one kind is one node of the scene: 3,000 keyframes are one set of lines, sent
-as one array.
+So up is what was up in the first image (y points down there), or on the body of a LiDAR, and the
+first look is from where the sensor says (`views.livesensor`), as far away as what it sees. Lines
+are a few pixels thick, whatever the scale. Everything of one kind is one node of the scene: 3,000
+keyframes are one set of lines, sent as one array.
 
 Nothing here reads a map or a clock; whoever calls decides how often (`odomap.viewing`).
 """
@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.geometry.camera import Camera
-from odomap.views.livepicture import shrunk
+from odomap.views.livefigure import LOST, SENSOR
+from odomap.views.livemap import Shown
+from odomap.views.livesensor import Sensor
 from odomap.views.scene import thin
 
 __all__ = ["LiveScene", "Panel"]
@@ -26,28 +27,23 @@ Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 PATH: Colour = (86, 180, 233)
-LOST: Colour = (255, 84, 60)
 KEYFRAME: Colour = (230, 159, 0)
-CAMERA: Colour = (53, 224, 161)
 LANDMARK: Colour = (150, 160, 176)
 SEEN: Colour = (240, 228, 66)
 LOOP: Colour = (255, 105, 210)
 TOLD: Colour = (84, 104, 130)
 GAP: Colour = (110, 118, 132)
-STATUS_COLOURS = {"tracking": CAMERA, "recovered": SEEN, "initializing": PATH, "lost": LOST}
+STATUS_COLOURS = {"tracking": SENSOR, "recovered": SEEN, "initializing": PATH, "lost": LOST}
 
 PATH_POINTS = 5000
 KEYFRAMES = 2000
 """At most so many are drawn, spread evenly."""
-FRUSTUM_IMAGE_PX = 320
-WIDEST_VIEW = 1.2
-"""Frusta are at most so wide at distance 1, also those of a fisheye."""
 
 DASHES = 12
 """Of a gap."""
 
-KEYFRAME_SIZE, CAMERA_SIZE, POINT_SIZE = 0.02, 0.07, 0.003
-"""Sizes as shares of the distance to what the camera sees."""
+END_SIZE = 0.009
+"""Of a loop's ends, as a share of the distance to what the sensor sees."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +68,22 @@ class LiveScene:
 
     Args:
         server: from `liveserver.open_server`.
-        camera: the lens of the camera that is tracked.
+        sensor: that is followed.
         frames: makes a slider over so many frames; 0 for none.
 
     Attributes:
-        reach: distance to what the camera sees, world units; sizes follow it.
+        figure: the sensor where it is now.
+        reach: distance to what the sensor sees, world units; sizes follow it.
     """
 
-    def __init__(self, server: Any, camera: Camera | None, frames: int = 0) -> None:
-        self._server = server
+    def __init__(self, server: Any, sensor: Sensor, frames: int = 0) -> None:
+        self._server, self._sensor = server, sensor
         self.reach = 1.0
-        wide, high = _opening(camera)
-        self._opening = wide, high
         server.scene.reset()
         server.gui.reset()
         self._make_panel(frames)
-        self._make_nodes(wide, high)
+        self._make_nodes()
+        self.figure = sensor.figure(server)
 
     def _make_panel(self, frames: int) -> None:
         gui = self._server.gui
@@ -95,14 +91,13 @@ class LiveScene:
         self._slider = None
         if frames:
             self._slider = gui.add_slider("frame", 0, max(frames - 1, 1), 1, frames - 1)
-        self._follow = gui.add_checkbox("follow camera", True)
+        self._follow = gui.add_checkbox(f"follow {self._sensor.name}", True)
         self._shows_keyframes = gui.add_checkbox("keyframes", True)
         self._shows_loops = gui.add_checkbox("loops", True)
         self._shows_told = gui.add_checkbox("path before loops", True)
         self._point_size = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
-        self._picture: Any = None
 
-    def _make_nodes(self, wide: float, high: float) -> None:
+    def _make_nodes(self) -> None:
         scene = self._server.scene
         self._world = scene.add_frame("/run", show_axes=False)
 
@@ -137,44 +132,33 @@ class LiveScene:
 
         self._loop_ends = dots("/run/loops/ends", LOOP)
         self._points = {
-            seen: dots(f"/run/landmarks/{name}", colour)
+            seen: dots(f"/run/map/{name}", colour)
             for seen, name, colour in ((False, "known", LANDMARK), (True, "in sight", SEEN))
         }
-        self._camera = scene.add_camera_frustum(
-            "/run/camera",
-            fov=2 * np.arctan(high),
-            aspect=wide / high,
-            color=CAMERA,
-            thickness=2.5,
-            thickness_units="screen",
-            visible=False,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
 
     # ---- what is shown ----
 
-    def face(self, T_world_camera: Array, reach: float) -> None:
-        """Choose up and the first look from where a camera is and how far it sees.
+    def face(self, T_world_sensor: Array, reach: float) -> None:
+        """Choose up and the first look from where the sensor is and how far it sees.
 
         Args:
-            T_world_camera: (4, 4) of the first image: x right, y down, z ahead.
+            T_world_sensor: (4, 4) at first.
             reach: distance to what it sees, world units.
         """
         self.reach = reach
-        self._server.scene.set_up_direction(-T_world_camera[:3, 1])
+        R_world_look = (T_world_sensor @ self._sensor.T_sensor_look)[:3, :3]
+        self._server.scene.set_up_direction(-R_world_look[:, 1])
         start = self._server.initial_camera
-        right, down, ahead = T_world_camera[:3, :3].T
-        start.position = -reach * (0.6 * ahead + 0.35 * down - 0.15 * right)
+        start.position = reach * (R_world_look @ self._sensor.eye)
         start.look_at = np.zeros(3)
         start.near, start.far = 1e-3 * reach, 1e4 * reach
-        self._camera.scale = CAMERA_SIZE * reach
+        self.figure.resize(reach)
 
     def show_path(self, positions: Array, is_lost: NDArray[np.bool_]) -> None:
         """Draw the path so far.
 
         Args:
-            positions: (N, 3) of the camera in the world.
+            positions: (N, 3) of the sensor in the world.
             is_lost: (N,) frames without a pose of their own.
         """
         keep = thin(len(positions), PATH_POINTS)
@@ -190,21 +174,20 @@ class LiveScene:
         """Draw the (N, 3) newest positions, from the end of the path on."""
         self._tail.points = np.stack([positions[:-1], positions[1:]], axis=1).astype(np.float32)
 
-    def show_map(self, points: Array, is_seen: NDArray[np.bool_], Ts_world_camera: Array) -> None:
-        """Draw landmarks and keyframes.
+    def show_map(self, shown: Shown, Ts_world_sensor: Array) -> None:
+        """Draw the points of a map, and keyframes.
 
         Args:
-            points: (M, 3) landmarks in the world.
-            is_seen: (M,) whether the newest keyframe sees them.
-            Ts_world_camera: (K, 4, 4) of the keyframes.
+            shown: the points.
+            Ts_world_sensor: (K, 4, 4) of the keyframes.
         """
-        keep = thin(len(Ts_world_camera), KEYFRAMES)
+        keep = thin(len(Ts_world_sensor), KEYFRAMES)
         with self._server.atomic():
             for wanted, node in self._points.items():
-                node.points = points[is_seen == wanted].astype(np.float32)
-            self._keyframes.points = frusta(
-                Ts_world_camera[keep], self._opening, KEYFRAME_SIZE * self.reach
-            )
+                node.points = shown.points[shown.is_seen == wanted].astype(np.float32)
+            if shown.colours is not None:  # what is in sight stands out by its own
+                self._points[False].colors = shown.colours[~shown.is_seen]
+            self._keyframes.points = self._sensor.marks(Ts_world_sensor[keep], self.reach)
 
     def show_loops(self, loops: Array, gaps: Array, told: Array) -> None:
         """Draw places that were seen before, and the path as it was until that was known.
@@ -222,31 +205,19 @@ class LiveScene:
             self._gaps.points = dashes(gaps)
             self._told.points = segments.astype(np.float32)
 
-    def show_camera(
-        self, T_world_camera: Array, wxyz: Array, image: NDArray[np.uint8] | None, is_lost: bool
+    def show_sensor(
+        self, T_world_sensor: Array, wxyz: Array, sight: NDArray[Any] | None, is_lost: bool
     ) -> None:
-        """Draw the camera where it is now.
+        """Draw the sensor where it is now.
 
         Args:
-            T_world_camera: (4, 4).
+            T_world_sensor: (4, 4).
             wxyz: (4,) its rotation.
-            image: (h, w, 3) RGB what it sees; None keeps the one before.
+            sight: what it sees, as `Sensor.sight` tells; None keeps what was there before.
             is_lost: whether it has no pose of its own.
         """
         with self._server.atomic():
-            self._camera.position = T_world_camera[:3, 3]
-            self._camera.wxyz = wxyz
-            self._camera.color = LOST if is_lost else CAMERA
-            self._camera.visible = True
-            if image is not None:
-                self._camera.image = shrunk(image, FRUSTUM_IMAGE_PX)
-                self._show_picture(image)
-
-    def _show_picture(self, image: NDArray[np.uint8]) -> None:
-        if self._picture is None:
-            self._picture = self._server.gui.add_image(image, jpeg_quality=80, order=1e9)
-        else:
-            self._picture.image = image
+            self.figure.show(T_world_sensor, wxyz, sight, is_lost)
 
     def say(self, panel: Panel) -> None:
         """Write the panel."""
@@ -270,36 +241,19 @@ class LiveScene:
         for node in (self._loops, self._loop_ends, self._gaps):
             node.visible = bool(self._shows_loops.value)
         self._told.visible = bool(self._shows_told.value)
-        self._loop_ends.point_size = 3.0 * POINT_SIZE * self.reach
+        self._loop_ends.point_size = END_SIZE * self.reach
         for seen, node in self._points.items():
-            size = POINT_SIZE * self.reach * float(self._point_size.value)
+            size = self._sensor.grain * self.reach * float(self._point_size.value)
             node.point_size = 1.5 * size if seen else size
+        self.figure.resize_points(size)
 
-    def follow(self, T_world_camera: Array) -> None:
-        """Keep the camera where every page looks, by moving the world under the viewers' eyes.
+    def follow(self, T_world_sensor: Array) -> None:
+        """Keep the sensor where every page looks, by moving the world under the viewers' eyes.
 
         Their eyes are their own: they turn and come closer as they like, and nothing pulls at them.
         """
         if self._follow.value:
-            self._world.position = -T_world_camera[:3, 3]
-
-
-def frusta(
-    Ts_world_camera: Array, opening: tuple[float, float], size: float
-) -> NDArray[np.float32]:
-    """Return the (8 K, 2, 3) edges of K cameras.
-
-    Args:
-        Ts_world_camera: (K, 4, 4).
-        opening: half width and half height of the image at distance 1.
-        size: length of a frustum, world units.
-    """
-    x, y = opening
-    tips = size * np.array([(0, 0, 0), (-x, -y, 1), (x, -y, 1), (x, y, 1), (-x, y, 1)])
-    edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
-    R, t = Ts_world_camera[:, :3, :3], Ts_world_camera[:, :3, 3]
-    world = np.einsum("kij,nj->kni", R, tips) + t[:, None]
-    return np.asarray(world[:, edges].reshape(-1, 2, 3), np.float32)
+            self._world.position = -T_world_sensor[:3, 3]
 
 
 def dashes(ends: Array) -> NDArray[np.float32]:
@@ -325,11 +279,3 @@ def panel_html(panel: Panel) -> str:
     )
     box = "padding:.3em 1em;font-size:.85em;font-variant-numeric:tabular-nums"
     return f'<div style="{box}">{head}<table>{lines}</table></div>'
-
-
-def _opening(camera: Camera | None) -> tuple[float, float]:
-    """Return half the width and height of the image at distance 1."""
-    if camera is None:
-        return 0.6, 0.4
-    wide = min(0.5 * camera.width / camera.fx, WIDEST_VIEW)
-    return wide, wide * camera.height / camera.width
