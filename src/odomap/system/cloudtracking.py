@@ -154,11 +154,12 @@ class CloudTracker:
     def _begin(self, view: CloudView) -> Estimate:
         """Begin a map with a sweep, or find it in the one that there is."""
         if self._map.num_keyframes:
-            found = self._finder.find(self._viewer.kept(view, self._twist))
+            twist = self._motion_seen(view)
+            found = self._finder.find(self._viewer.kept(view, twist))
             view.clock.lap("track")
             if isinstance(found, str):
                 return self._pass_over(view, f"not recognised: {found}")
-            return self._enter(view, found, Status.TRACKING)
+            return self._enter(view, found, Status.TRACKING, twist)
         # How the body moved over it nobody knows yet, so nothing of it is kept.
         self._start(view)
         k = self._new_keyframe(view, np.eye(4), np.zeros((6, 6)))
@@ -172,6 +173,19 @@ class CloudTracker:
         self._twist, self._lost, self._first = np.zeros(6), 0, view
         self._front_end.insert(view.prepared, self._T_odom_middle, self._twist)
         self._middle_ns = max(_middle_ns(view), self._middle_ns)
+
+    def _motion_seen(self, view: CloudView) -> Array:
+        """Return the motion (6,) since the sweep before, of a body that is not yet in the map."""
+        before, seconds, twist = self._first, self._seconds_since(view), np.zeros(6)
+        if before is not None and 0.0 < seconds < LONGEST_S:
+            match, twist = self._match(view, seconds)
+            if self._is_wrong(match, seconds):
+                twist = np.zeros(6)
+        self._start(view)
+        self._front_end.clear()
+        self._front_end.insert(view.prepared, self._T_odom_middle, twist)
+        self._twist = twist
+        return twist
 
     def _begin_again(
         self, first: CloudView, view: CloudView, seconds: float, twist: Array
@@ -263,7 +277,7 @@ class CloudTracker:
             found = self._finder.find(seen, self.path.last_pose())
             view.clock.lap("track")
             if not isinstance(found, str):
-                return self._enter(view, found, Status.RECOVERED)
+                return self._enter(view, found, Status.RECOVERED, np.zeros(6))
             reason = f"{reason}; {found}"
         last = self.path.last
         return Estimate(
@@ -272,13 +286,14 @@ class CloudTracker:
             self.path.gap_covariance(view.frame.stamp_ns), timing=view.clock.laps,
         )  # fmt: skip
 
-    def _enter(self, view: CloudView, found: FoundCloud, status: Status) -> Estimate:
-        """Go on in the map, where a sweep was recognised."""
+    def _enter(self, view: CloudView, found: FoundCloud, status: Status, twist: Array) -> Estimate:
+        """Go on in the map, where a sweep was recognised, with a motion (6,)."""
         k, stamp_ns = found.keyframe_id, view.frame.stamp_ns
         T_world_keyframe = self._map.T_world_body(k)
         self._start(view)
-        self._first = None
-        self._T_odom_body = self._T_odom_middle = T_world_keyframe @ found.T_keyframe_body
+        self._first, self._twist = None, twist
+        self._T_odom_body = T_world_keyframe @ found.T_keyframe_body
+        self._T_odom_middle = self._T_odom_body @ se3_exp(view.middle * twist)
         self._keyframe, self._T_odom_keyframe = k, T_world_keyframe
         self._drift = np.zeros((6, 6))
         self._step = np.asarray(np.linalg.inv(found.information))
