@@ -3,10 +3,10 @@
     ... | python lidar3d_peer.py OUT.npz [--deskew] [--voxel 1.0] [--farthest 100]
 
 On standard input one sweep after the other: the number of its points as int64, then of each as
-float64 x, y, z, and when in the sweep it was measured, seconds. Written: poses (M, 4, 4) and the
-wall-clock milliseconds of each sweep. With --deskew KISS-ICP takes out the motion that it found for
-the sweep before; its poses are then those at the end of a sweep. Needs numpy and kiss_icp; odomap
-is not imported.
+float64 x, y, z, and when in the sweep it was measured, seconds. Written: poses (M, 4, 4) and of
+each sweep the milliseconds that passed and those of processors (M, 2). With --deskew KISS-ICP takes
+out the motion that it found for the sweep before; its poses are then those at the end of a sweep.
+Needs numpy and kiss_icp; odomap is not imported.
 """
 
 import argparse
@@ -34,9 +34,10 @@ def main() -> int:
     while (rows := next_sweep()) is not None:
         points = np.ascontiguousarray(rows[:, :3], np.float64)
         times = np.array(rows[:, 3], np.float64) if options.deskew else np.array([])
-        start = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         odometry.register_frame(points, times)
-        ms.append(1e3 * (time.perf_counter() - start))
+        end = time.perf_counter(), time.process_time()
+        ms.append([1e3 * (after - before) for before, after in zip(start, end)])
         poses.append(np.array(odometry.last_pose))
     np.savez(options.out, Ts=np.array(poses), ms=np.array(ms))
     return 0

@@ -69,7 +69,7 @@ def test_only_a_peer_is_judged_at_the_moment_that_suits_it(odometry):
 
     def found(who, is_compensated):
         way = odometry.Way(who, is_compensated)
-        return odometry.found(at_the_end, truth, spans, way, [5.0] * 9, 0)
+        return odometry.found(at_the_end, truth, spans, way, np.full((9, 2), 5.0), 0)
 
     assert found("KISS-ICP", True).ate_m < 1e-9
     assert found("KISS-ICP", True).deg_per_m < 1e-9
@@ -83,13 +83,14 @@ def test_figures_are_those_of_a_path_that_is_off_by_a_known_share(odometry):
     truth = a_drive(200, np.array([8.0, 0, 0, 0, 0, 0]))
     off = a_drive(200, np.array([8.08, 0, 0, 0, 0, 1e-4]))
     way = odometry.Way("points", True)
-    found = odometry.found(off, truth, np.zeros((200, 2)), way, [900.0, 900.0, 1.0, 2.0, 9.0], 3)
+    ms = np.outer([900.0, 900.0, 1.0, 2.0, 9.0], [1.0, 0.5])
+    found = odometry.found(off, truth, np.zeros((200, 2)), way, ms, 3)
     assert found.percent == pytest.approx(1.0, rel=0.05)
     assert 8.0 * found.deg_per_m == pytest.approx(np.degrees(1e-4), rel=0.02)
     assert found.per10_m == pytest.approx(0.1, rel=0.05)
-    assert (found.ms, found.lost) == (2.0, 3)
+    assert (found.ms, found.cpu_ms, found.lost) == (2.0, 1.0, 3)
     first = [Trajectory(t.stamps_ns[:20], t.Ts_world_body[:20]) for t in (off, truth)]
-    short = odometry.found(*first, np.zeros((20, 2)), way, [1.0] * 9, 0)
+    short = odometry.found(*first, np.zeros((20, 2)), way, ms, 0)
     assert np.isnan(short.percent)
     assert np.isfinite(short.per10_m)
 
@@ -123,7 +124,7 @@ def test_sweeps_arrive_at_the_peer_as_they_are(odometry, tmp_path, monkeypatch, 
     steps = [c[:, 0].mean() + is_compensated * 100 * t.sum() for c, t in zip(clouds, times)]
     np.testing.assert_allclose(path.Ts_world_body[:, 0, 3], np.cumsum(steps))
     np.testing.assert_array_equal(path.stamps_ns, truth.stamps_ns)
-    assert (len(ms), lost) == (4, 0)
+    assert (ms.shape, lost) == ((4, 2), 0)
 
 
 def test_a_peer_that_fails_is_told_of(odometry, tmp_path, monkeypatch):
@@ -180,7 +181,7 @@ def bench(load):
 )
 def test_what_counts_as_missed_beside_the_peer(bench, who, changes, says):
     module, kept = bench
-    peer = module.Found(0.1, 0.3, 0.1, np.nan, np.nan, 100.0, 150.0, 0)
+    peer = module.Found(0.1, 0.3, 0.1, np.nan, np.nan, 100.0, 150.0, 90.0, 0)
     ours = dataclasses.replace(peer, ms=33.0)
     module.below_kiss(kept, who, dataclasses.replace(ours, **changes), peer)
     assert len(kept.missed) == (says is not None)
@@ -189,7 +190,7 @@ def test_what_counts_as_missed_beside_the_peer(bench, who, changes, says):
 
 def test_the_best_of_a_peer_is_that_of_each_figure(bench):
     module, _ = bench
-    a = module.Found(0.1, 0.3, 0.1, 1.0, 0.01, 100.0, 150.0, 0)
+    a = module.Found(0.1, 0.3, 0.1, 1.0, 0.01, 100.0, 150.0, 90.0, 0)
     b = dataclasses.replace(a, ate_m=0.2, per10_m=0.1, ms=90.0)
     assert module.over([a, b], np.min) == dataclasses.replace(a, per10_m=0.1, ms=90.0)
     assert module.over([a, b, b], np.median) == b
