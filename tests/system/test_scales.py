@@ -53,15 +53,17 @@ def drift(slam, total=0.3):
 def count_in(slam, units):
     """Have keyframes count in other units, and leave all in the world as it is."""
     m, path = slam.map, slam._tracker.path
-    ids, frames = m.keyframe_ids, [(f, path._pose(f), m.scale(f.keyframe_id)) for f in path._frames]
+    ids, placed = m.keyframe_ids, [path[n] for n in range(len(path))]
+    frames = [
+        (f, m.place(f.keyframe_id, f.T_keyframe_body), m.scale(f.keyframe_id)) for f in placed
+    ]
     scales, sure = units(ids), m.states.covariances[ids].copy()
     m.apply(update(m, ids, m.Ts_world_body(ids), scales, m.landmark_ids))
     m.set_covariance(ids, sure)
     for n, (frame, T, before) in enumerate(frames):
         T_keyframe_body = m.relative(frame.keyframe_id, T)
         own = stretched(frame.covariance, before / m.scale(frame.keyframe_id))
-        path._frames[n] = replace(frame, T_keyframe_body=T_keyframe_body, covariance=own)
-    path._units *= m.scale(path.last.keyframe_id) / frames[-1][2]
+        path.replace(n, replace(frame, T_keyframe_body=T_keyframe_body, covariance=own))
 
 
 def as_in_the_world(slam):
