@@ -11,7 +11,7 @@ import odomap
 from odomap.evaluation.walls import compare_walls
 from odomap.system.stages import Loop
 
-WORLD = "sim:building?sensors=laser&seed=2&rounds=1.15&rate_hz=5&beams=61&range_m=6&noise=2"
+WORLD = "sim:building?sensors=laser&seed=1&rounds=1.15&rate_hz=5&beams=61&range_m=6&noise=2"
 
 
 def run(source: odomap.Source, closing: bool) -> tuple[odomap.Result, list[Loop]]:
