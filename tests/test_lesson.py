@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from odomap.sensors.frame import Frame
+from odomap.simulation.sweepworld import SweepWorld
 from odomap.simulation.world import World
 from printed import assert_same_output
 
@@ -35,17 +36,21 @@ EXAMPLE = re.compile(r"\(\.\./\.\./(examples/\w+\.py)\)")
 @pytest.fixture(scope="module", autouse=True)
 def _pictures_are_rendered_once():
     """Chapters, exercises and programs look at the same worlds."""
-    render, made = World.frame, {}
+    made: dict[Any, Frame] = {}
 
-    def frame(self: World, index: int) -> Frame:
-        key = self.spec, index
-        if key not in made:
-            made[key] = render(self, index)
-        # With depth frames are large, and few of those worlds are looked at twice.
-        return made[key] if made[key].depth is None else made.pop(key)
+    def remembered(render: Any) -> Any:
+        def frame(self: Any, index: int) -> Frame:
+            key = self.spec, index
+            if key not in made:
+                made[key] = render(self, index)
+            # With depth frames are large, and few of those worlds are looked at twice.
+            return made[key] if made[key].depth is None else made.pop(key)
+
+        return frame
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(World, "frame", frame)
+        for world in (World, SweepWorld):
+            patch.setattr(world, "frame", remembered(world.frame))
         yield
 
 
@@ -165,7 +170,7 @@ def test_an_example_prints_what_is_shown(name):
         (ORB_SLAM, range(18, 24)),
         (PLACES, range(24, 25)),
         (LOOPS, range(25, 30)),
-        (LASERS, range(30, 39)),
+        (LASERS, range(30, 48)),
     ],
 )
 def test_all_examples_of_a_chapter_are_shown(page, numbers):
@@ -339,6 +344,67 @@ def test_bounds_spare_nearly_all_poses():
 def test_a_robot_finds_itself_in_a_saved_grid():
     for off in ran("38_localise_in_a_grid.py")[0].values():
         assert max(off) < 40.0
+
+
+def test_a_sweep_is_straightened_by_its_motion():
+    for off in ran("39_deskew.py")[0].values():
+        deskewed, back = (off[f"p' = exp({xi} t) p"] for xi in ("xi", "-xi"))
+        assert deskewed < 10.0 < off["as they came"] < back
+        assert off["the same, xi of the sweep before"] < 1.5 * deskewed
+
+
+def test_a_sweep_fits_the_cells_best_where_it_belongs():
+    scores = ran("40_ndt.py")[0]
+    assert [s.argmax() for s in scores.values()] == 3 * [24]
+    assert scores[1.0].max() < scores[2.0].max() < scores[4.0].max()
+
+
+def test_surfaces_are_worth_more_than_points_of_rings():
+    medians = {way: 1000 * np.median(off[0]) for way, off in ran("41_four_methods.py")[0].items()}
+    assert max(medians["gicp"], medians["ndt"]) < medians["plane"] < medians["icp"]
+    assert 3 * medians["ndt"] < medians["icp"]
+
+
+def test_cars_pull_squares_away():
+    off = ran("42_planes_in_voxels.py")[0]
+    assert off["robust"][-1] < 5.0 < 30.0 < off["squares"][-1]
+
+
+def test_the_sharpest_points_are_not_the_edges():
+    true = ran("43_edges_and_planes.py")[0]
+    assert true["sharpest"] < true["none hidden"] < 0.7
+    assert min(true["LOAM"], true["LeGO-LOAM"]) > 0.93
+
+
+def test_the_ground_and_edges_say_different_things():
+    off = {name: np.abs(xi) for name, xi in ran("44_two_steps.py")[0].items()}
+    upright, level = [0, 1, 5], [2, 3, 4]  # of x y z, roll pitch yaw
+    guess, ground, edges = off["the guess"], off["the ground alone"], off["edges alone"]
+    assert np.all(ground[level] < 0.2 * guess[level])
+    assert np.all(ground[upright] > 0.7 * guess[upright])
+    assert np.all(edges[upright] < 0.2 * guess[upright])
+    assert edges[2] > 0.5 * guess[2]
+    assert np.linalg.norm(off["in turn, then all"][:3]) < 0.03
+
+
+def test_all_front_ends_follow_a_lidar_and_want_times():
+    ate = ran("45_three_front_ends.py")[0]
+    for front_end in {name for name, _ in ate}:
+        assert ate[front_end, "deskewed"] < 0.03
+        assert 2.0 * ate[front_end, "deskewed"] < ate[front_end, "as they came"]
+
+
+def test_a_place_is_known_turned_and_from_beside():
+    right = ran("46_scan_context.py")[0]
+    assert right["as it came"] == right["turned by 180 deg"] >= 10
+    assert right["3 m to the left"] < 5 < 8 < right["the same, looked for beside"]
+
+
+def test_loops_bring_a_street_back_to_itself():
+    (ate, off, points), (ate_with, off_with, points_with) = ran("47_cloud_map.py")[0].values()
+    assert 2.0 * ate_with < ate
+    assert 4.0 * off_with < off
+    assert points_with < points
 
 
 @pytest.mark.parametrize("printed", ["off by 3.2 mm, ok", "off by 2.1 mm, no", "off by 2.1 mm"])
