@@ -282,21 +282,22 @@ def rays() -> Figure:
 
 
 def grid_loops() -> Figure:
-    """The grid of a building without loops and with them, and a corner of both."""
+    """The grid of a building without loops and with them, and where it begins."""
     names = example("36_laser_slam")
     source = odomap.open(names["WORLD"])
-    figure = new_figure(9.6, 3.7)
-    figure.subplots_adjust(left=0.03, right=0.995, bottom=0.07, top=0.92)
-    axes = figure.subplots(1, 4, gridspec_kw={"wspace": 0.12, "width_ratios": [1, 1, 1, 1]})
+    figure = new_figure(9.6, 6.4)
+    figure.subplots_adjust(left=0.03, right=0.995, bottom=0.05, top=0.95)
+    sizes = {"wspace": 0.1, "hspace": 0.12, "height_ratios": [1.1, 1.0]}
+    axes = figure.subplots(2, 2, gridspec_kw=sizes).ravel()
     for n, (title, closing) in enumerate((("without loops", False), ("with loops", True))):
         result, _ = names["run"](source, closing)
         grid = odomap.occupancy_grid(result.map, source.rig)
         path = result.trajectory.positions[:, :2]
-        for ax, words in ((axes[n], title), (axes[2 + n], "the corner, " + title)):
+        for ax, words in ((axes[n], title), (axes[2 + n], "the beginning, " + title)):
             shown_grid(ax, grid, words)
             ax.plot(*path.T, color=BLUE, lw=1.0)
-        axes[n].set(xlim=(-9, 11), ylim=(-4.5, 23))
-        axes[2 + n].set(xlim=(3.2, 9.6), ylim=(-2.2, 6.6))
+        axes[n].set(xlim=(path[:, 0].min() - 4, path[:, 0].max() + 4))
+        axes[2 + n].set(xlim=(-0.5, 10.5), ylim=(-3.2, 2.2))
     return figure
 
 
