@@ -30,7 +30,7 @@ from odomap.geometry.so3 import hat
 from odomap.kernels import kernel
 from odomap.lidar.icp import SLOTS, add_plane
 
-__all__ = ["Certainty", "judge", "warm_up"]
+__all__ = ["Certainty", "judge", "known_part", "named", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -91,21 +91,40 @@ def judge(
     motion = _motion(sums[2]) + known * 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
     fits = _symmetric(sums[0]) - noise
     noise, motion, fits = (M[np.ix_(free, free)] / known for M in (noise, motion, fits))
-    L = np.linalg.cholesky(motion)
-    inverse = np.linalg.inv(L)
-    shares, axes = np.linalg.eigh(inverse @ fits @ inverse.T)
-    shares = np.maximum(shares, 0.0)
-    chance = np.einsum("ji,jk,ki->i", axes, inverse @ noise @ inverse.T, axes)
-    is_weak = shares < LEAST_SHARE + NOISE_FACTOR * chance
-    weak = _parted((inverse.T @ axes).T[is_weak], 2 if planar else 3)
-    # What may be chance is no information: whoever fuses with it would be led astray.
-    root = L @ axes * np.sqrt(np.where(is_weak, 0.0, shares))
+    root, weak = known_part(fits, noise, motion)
     shift = np.eye(6)
     shift[:3, 3:] = -hat(origin)
     root = shift[np.ix_(free, free)].T @ root
     information = root @ root.T * (known / variance)
     lever = np.where(free < 3, 1.0, radius)
-    return Certainty(information, weak, error, _sentence(weak * lever, planar))
+    return Certainty(information, weak, error, named(weak * lever, planar))
+
+
+def known_part(
+    fits: Array, noise: Array, motion: Array, least: float = LEAST_SHARE
+) -> tuple[Array, Array]:
+    """Part what is known of a motion from what is not.
+
+    Args:
+        fits: (D, D) how much of a motion is seen across surfaces, without what noise pretends.
+        noise: (D, D) what noise pretends.
+        motion: (D, D) how much points move.
+        least: share of a motion that must be seen.
+
+    Returns:
+        (D, D) a root of the information, zero along what is weak; (K, D) what is, each of a length
+        that moves points by 1 m, root mean square, where `motion` is of one point.
+    """
+    L = np.linalg.cholesky(motion)
+    inverse = np.linalg.inv(L)
+    shares, axes = np.linalg.eigh(inverse @ fits @ inverse.T)
+    shares = np.maximum(shares, 0.0)
+    chance = np.einsum("ji,jk,ki->i", axes, inverse @ noise @ inverse.T, axes)
+    is_weak = shares < least + NOISE_FACTOR * chance
+    # What may be chance is no information: whoever fuses with it would be led astray.
+    root = L @ axes * np.sqrt(np.where(is_weak, 0.0, shares))
+    weak = (inverse.T @ axes).T[is_weak]
+    return np.asarray(root), _parted(weak, 2 if len(weak.T) < 6 else 3)
 
 
 @kernel
@@ -183,8 +202,13 @@ def _parted(weak: Array, turns: int) -> Array:
     return np.asarray(mix.T @ weak)
 
 
-def _sentence(weak: Array, planar: bool) -> str:
-    """Name weak directions: along what the source may slide, about what it may turn."""
+def named(weak: Array, planar: bool = False) -> str:
+    """Name weak directions: along what the source may slide, about what it may turn.
+
+    Args:
+        weak: (K, 6) or (K, 3) tangents, rotations in units of how far they move points.
+        planar: whether they are of x, y and θ.
+    """
     if not len(weak):
         return ""
     named = []

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from odomap.geometry.lie import se3_inverse, se3_log
 from odomap.lidar.cloudconfig import PointsConfig
+from odomap.lidar.degeneracy import named
 from odomap.lidar.deskew import deskew
 from odomap.lidar.frontend import SweepMatch
 from odomap.lidar.planemap import PlaneMap
-from odomap.lidar.planematching import match_planes
+from odomap.lidar.planematching import PlaneMatch, match_planes
 from odomap.lidar.sweeps import SweepPoints
 from odomap.lidar.voxels import first_in_voxels
 
@@ -52,7 +53,7 @@ class PlaneFrontEnd:
         self._config = PointsConfig() if config is None else config
         self._voxel = self._config.voxel
         self._map: PlaneMap | None = None
-        self._off2, self._far = self._config.first_off**2, 0.0
+        self._off2 = self._config.first_off**2
 
     def prepare(self, sweep: SweepPoints) -> ThinSweep:
         """Thin a sweep out."""
@@ -72,12 +73,14 @@ class PlaneFrontEnd:
             return SweepMatch(T_map_body, np.zeros((6, 6)), 0, len(points), 0.0, False, "no map")
         surfaces, config = self._map, self._config
         wide = 9.0 * (1.0 + self._off2 / surfaces.sigma**2)
-        T, H, on, mean, is_still = match_planes(surfaces, points, T_map_body, wide)
-        self._note(T_map_body, T, points)
-        information = H / (config.alike * max(mean, config.least_spread))
-        error = surfaces.sigma * float(np.sqrt(mean))
-        reason = "" if is_still else "it did not come to rest"
-        return SweepMatch(T, information, on, len(points), error, is_still, reason)
+        found = match_planes(surfaces, points, T_map_body, wide)
+        self._note(T_map_body, found.T_map_body, points)
+        information = found.information / (config.alike * max(found.mean, config.least_spread))
+        error = surfaces.sigma * float(np.sqrt(found.mean))
+        return SweepMatch(
+            found.T_map_body, information, found.on, len(points), error, found.is_still,
+            _reason(found, points),
+        )  # fmt: skip
 
     def _note(self, T_guess: Array, T: Array, points: Array) -> None:
         """Learn from how far the guess was off."""
@@ -105,6 +108,14 @@ class PlaneFrontEnd:
     def clear(self) -> None:
         """Forget the map."""
         self._map, self._off2 = None, self._config.first_off**2
+
+
+def _reason(found: PlaneMatch, points: Array) -> str:
+    """Say what is wrong with a match; empty if nothing is."""
+    if len(found.weak):
+        far = float(np.sqrt(np.mean(np.einsum("ni,ni->n", points, points))))
+        return named(found.weak * np.repeat((1.0, far), 3))
+    return "" if found.is_still else "it did not come to rest"
 
 
 def suitable_voxel(points: Array, config: PointsConfig) -> float:

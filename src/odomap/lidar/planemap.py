@@ -35,7 +35,7 @@ from odomap.lidar.voxels import (
     slot_of,
 )
 
-__all__ = ["COARSER", "FAR_AWAY", "NONE", "OLD", "SURFACE", "PlaneMap", "plane_kernel"]
+__all__ = ["COARSER", "FAR_AWAY", "NONE", "OLD", "SURFACE", "TILT", "PlaneMap", "plane_kernel"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -47,6 +47,8 @@ COARSER = 3
 """Size of large voxels in small ones."""
 FAR_AWAY = FURTHEST // 2
 """Where along x large voxels are in the table, in voxels; small ones stay nearer."""
+TILT = 3
+"""Column of a voxel's mean that says how far its normal may be tilted: δ², radians squared."""
 FEWEST = 6
 """Points from which on they may lie in a plane."""
 MANY = 400.0
@@ -85,6 +87,7 @@ def plane_kernel(
     share = 1.0 - least / (THIN * middle)
     length = np.sqrt(share / ((least + sigma2) * square))
     normals[v, 0], normals[v, 1], normals[v, 2] = length * x, length * y, length * z
+    means[v, TILT] = least * middle / (n * (middle - least) ** 2)
     return True
 
 
@@ -175,7 +178,7 @@ class PlaneMap:
     def _make(self, room: int) -> None:
         self.table, self.keys = new_table(room), np.empty(room, np.int64)
         self.sums, self.flags = np.empty((room, 10)), np.zeros(room, np.int8)
-        self.means, self.normals = np.empty((room, 3)), np.empty((room, 3))
+        self.means, self.normals = np.empty((room, 4)), np.empty((room, 3))
 
     def insert(self, points: Array) -> None:
         """Add points (N, 3) in the map's frame; those too far from its origin are left out."""
