@@ -29,7 +29,7 @@ from odomap.system.cloudconfig import CloudClosingConfig
 from odomap.system.cloudgraph import CloudPath, Tie, graph_of
 from odomap.system.cloudplaces import MapCopy, Places, cloud_points, copy_map, places_of
 from odomap.system.cloudsearch import Candidate, CloudSearch
-from odomap.system.cloudverifying import CloudJudge
+from odomap.system.cloudverifying import CloudJudge, Laid
 from odomap.system.correction import correction
 from odomap.system.stages import Loop
 
@@ -123,8 +123,9 @@ class CloudCloser:
         up = places.Ts_world_lidar[row, 2, :3]
         laid = self._judge.lay(places, candidate, cloud_points(keyframe), up)
         ends, T = (keyframe.id, int(places.ids[candidate.row])), laid.T_place_body
-        if laid.reason:
-            return Loop(*ends, T, laid.num_inliers, False, laid.reason)
+        reason = laid.reason or _unfixed(laid, self._config.sigma)
+        if reason:
+            return Loop(*ends, T, laid.num_inliers, False, reason)
         return Tie(*ends, T, laid.information, laid.num_inliers)
 
     def solve(self, places: Places, ties: list[Tie]) -> CloudPath:
@@ -285,6 +286,12 @@ def _is_same(T: Array, other: Array) -> bool:
 
 def _refused(tie: Tie, reason: str) -> Loop:
     return Loop(*tie.ends, tie.T_matched_keyframe, tie.num_inliers, False, reason)
+
+
+def _unfixed(laid: Laid, most: float) -> str:
+    """Say that what was seen does not fix a place, as any is as good along a tunnel; else ""."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(laid.information)[:3, :3])[-1]))
+    return f"what it shows fixes the place to {sigma:.1f} m only" if sigma > most else ""
 
 
 def _contradiction(places: Places, tie: Tie) -> str:

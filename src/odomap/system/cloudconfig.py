@@ -40,6 +40,10 @@ class CloudTrackingConfig:
     """Standard deviation of what changes a velocity, m/s²."""
     angular: Positive = 3.0
     """The same of a rotation, rad/s²."""
+    unknown: Positive = 10.0
+    """Standard deviation of a velocity of which nothing is known, m/s."""
+    unknown_rad: Positive = 1.0
+    """The same of a rotation, rad/s."""
     unseen: Positive = 2.0
     """Standard deviation of a velocity that nobody saw for a while, m/s."""
     unseen_rad: Positive = 0.5
@@ -53,7 +57,8 @@ class CloudTrackingConfig:
     left: Positive = 10.0
     """How far a body that is only placed goes until that is made anew, metres."""
     patience: Count = 10
-    """Sweeps in a row that are placed nowhere, after which a piece of the map is begun."""
+    """Sweeps in a row that show something and are placed nowhere, after which a piece of the map
+    is begun."""
     keyframe_m: Positive = 2.0
     """Distance from the last keyframe at which a sweep becomes one, metres."""
     keyframe_rad: Positive = 0.5
@@ -112,6 +117,8 @@ class CloudClosingConfig:
     """Largest root mean square distance of its points from the surface there, in voxels."""
     against: Fraction = 0.08
     """Share of that which the other may have looked through, relative to both."""
+    sigma: Positive = 1.0
+    """Largest standard deviation of where a place is seen from there, metres."""
     solve_every: Count = 8
     """Keyframes after which the path is solved anew if there are new loops; in large maps more."""
     solve_share: Fraction = 0.02

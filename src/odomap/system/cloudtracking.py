@@ -11,16 +11,13 @@ middle.
 
 The map of the front-end is in a frame of odometry that nothing ever moves; a frame hangs from its
 keyframe, and loops move those and never pull the tracker from under its feet. What a match says of
-a step is weighed against how a body can move at all,
-
-    P_step = (Q⁻¹ + Λ)⁻¹,        Q = diag(σ_a Δt², σ_ω Δt)²,
-
-so along a tunnel, of whose length walls say nothing, the covariance grows.
+a step is weighed against how a body can move at all (`cloudmotion`), so along a tunnel, of whose
+length walls say nothing, it goes on as before and the covariance grows.
 
 A sweep that says nothing is lost; the body is taken to go on, and the next one that fits where it
-may be by then is where it goes on. Where nothing fits it is looked for in the whole map
-(`cloudrecognition`), and after a while a piece of its own is begun, to be joined when it is
-recognised.
+may be by then is where it goes on. Where nothing fits, or nothing was seen for long, it is looked
+for in the whole map (`cloudrecognition`), and after a while a piece of its own is begun, to be
+joined when it is recognised.
 
 Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8(2), 2023.
 """
@@ -32,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.errors import CalibrationError
-from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
+from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
 from odomap.geometry.so3 import orthonormalize
 from odomap.lidar.frontend import FrontEnd, SweepMatch
@@ -42,6 +39,7 @@ from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.cloudconfig import CloudTrackingConfig
+from odomap.system.cloudmotion import CloudMotion
 from odomap.system.cloudrecognition import CloudFinder, FoundCloud
 from odomap.system.cloudsurroundings import Surroundings
 from odomap.system.cloudview import CloudView, CloudViewer
@@ -52,12 +50,13 @@ __all__ = ["CloudTracker"]
 Array = NDArray[np.float64]
 
 ANEW = "started anew where it was last: how it moved since is not known"
+ASTRAY = "it may be anywhere: it was carried off, or not seen for long"
+UNKNOWN = np.zeros(6), np.zeros((6, 6))
+"""A motion of which nothing is known, and its information."""
+GLIMPSE_S = 0.5
+"""Longest time between two sweeps that show how a body moves of which nothing else is known."""
 AGAIN = 2
 """How often the first sweep is laid down again, each time with the motion found before."""
-LEARNING = 0.1
-"""Weight of the last sweep in how unsteady the motion is."""
-LONGEST_S = 1.0
-"""Time over which a body is taken to go on as before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,18 +95,17 @@ class CloudTracker:
         self._finder, self._is_mapping = finder, is_mapping
         self._around = Surroundings(map, viewer.T_body_lidar, config)
         self.path = Path(map)
-        self._T_odom_middle, self._twist = np.eye(4), np.zeros(6)
-        self._middle_ns = 0
+        self._motion = CloudMotion(config)
         self._T_odom_body = np.eye(4)
         self._keyframe, self._T_odom_keyframe = -1, np.eye(4)
-        self._drift = np.zeros((6, 6))
-        self._step = np.zeros((6, 6))
-        self._unsteady2 = np.zeros(6)
+        self._tie = ODOMETRY
         self._wanted: _Wanted | None = None
         self._made: int | None = None
         self._before: CloudView | None = None
-        self._lost = 0
+        self._lost = self._unplaced = 0
+        self._is_astray = False
         self._first: CloudView | None = None
+        self._glimpsed: CloudView | None = None
 
     def prepare(self, frame: Frame) -> CloudView:
         """Make a sweep ready, without looking at the map."""
@@ -131,7 +129,10 @@ class CloudTracker:
             return self._pass_over(view, reason)
         if self._keyframe < 0:
             return self._begin(view)
-        seconds = self._seconds_since(view)
+        seconds = self._motion.seconds_to(_middle_ns(view))
+        self._is_astray = self._is_astray or self._motion.is_anywhere(seconds)
+        if self._is_astray:
+            return self._lose(view, ASTRAY)
         match, twist = self._match(view, seconds)
         is_second = self._first is not None and not self._is_wrong(match, seconds)
         if self._first is not None and is_second:
@@ -154,38 +155,43 @@ class CloudTracker:
     def _begin(self, view: CloudView) -> Estimate:
         """Begin a map with a sweep, or find it in the one that there is."""
         if self._map.num_keyframes:
-            twist = self._motion_seen(view)
-            found = self._finder.find(self._viewer.kept(view, twist))
+            known = self._glimpse(view)
+            found = self._finder.find(self._viewer.kept(view, known[0]))
             view.clock.lap("track")
             if isinstance(found, str):
                 return self._pass_over(view, f"not recognised: {found}")
-            return self._enter(view, found, Status.TRACKING, twist)
+            return self._enter(view, found, Status.TRACKING, known)
         # How the body moved over it nobody knows yet, so nothing of it is kept.
         self._start(view)
         k = self._new_keyframe(view, np.eye(4), np.zeros((6, 6)))
         placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
         return self._placed(view, placed, Status.TRACKING, "", len(view))
 
+    def _glimpse(self, view: CloudView) -> tuple[Array, Array]:
+        """Return how a body moves of which no place is known, as the sweep before shows."""
+        before, self._glimpsed = self._glimpsed, view
+        seconds = 0.0 if before is None else (_middle_ns(view) - _middle_ns(before)) * 1e-9
+        if before is None or not 0.0 < seconds < GLIMPSE_S:
+            return UNKNOWN
+        self._start(before)
+        match, twist = self._match(view, seconds)
+        if self._is_wrong(match, seconds):
+            return UNKNOWN
+        match, twist = self._begin_again(before, view, seconds, twist)
+        self._motion.know(twist, match.information * seconds**2)
+        return self._motion.known
+
     def _start(self, view: CloudView) -> None:
         """Begin the front-end's map with a sweep."""
         self._front_end.clear()
-        self._T_odom_middle, self._T_odom_body = np.eye(4), np.eye(4)
-        self._twist, self._lost, self._first = np.zeros(6), 0, view
-        self._front_end.insert(view.prepared, self._T_odom_middle, self._twist)
-        self._middle_ns = max(_middle_ns(view), self._middle_ns)
+        self._T_odom_body, self._first, self._tie = np.eye(4), view, ODOMETRY
+        self._motion.begin(np.eye(4), _middle_ns(view))
+        self._front_end.insert(view.prepared, np.eye(4), np.zeros(6))
 
-    def _motion_seen(self, view: CloudView) -> Array:
-        """Return the motion (6,) since the sweep before, of a body that is not yet in the map."""
-        before, seconds, twist = self._first, self._seconds_since(view), np.zeros(6)
-        if before is not None and 0.0 < seconds < LONGEST_S:
-            match, twist = self._match(view, seconds)
-            if self._is_wrong(match, seconds):
-                twist = np.zeros(6)
+    def _found(self, view: CloudView) -> None:
+        """Begin with a sweep after none was placed for a while."""
         self._start(view)
-        self._front_end.clear()
-        self._front_end.insert(view.prepared, self._T_odom_middle, twist)
-        self._twist = twist
-        return twist
+        self._lost, self._unplaced, self._is_astray, self._glimpsed = 0, 0, False, None
 
     def _begin_again(
         self, first: CloudView, view: CloudView, seconds: float, twist: Array
@@ -194,20 +200,20 @@ class CloudTracker:
         self._first = None
         for _ in range(AGAIN):
             self._front_end.clear()
-            self._T_odom_middle, self._twist = se3_exp(first.middle * twist), twist
-            self._front_end.insert(first.prepared, self._T_odom_middle, twist)
+            motion = self._motion
+            motion.T_odom_middle, motion.twist = se3_exp(first.middle * twist), twist
+            self._front_end.insert(first.prepared, motion.T_odom_middle, twist)
             match, twist = self._match(view, seconds)
-        self._T_odom_keyframe = self._T_odom_middle @ se3_exp(-first.middle * twist)
+        self._T_odom_keyframe = self._motion.T_odom_middle @ se3_exp(-first.middle * twist)
         return match, twist
 
     def _match(self, view: CloudView, seconds: float) -> tuple[SweepMatch, Array]:
         """Lay a sweep down where it should be, and again with the motion that this gives."""
-        twist, T = self._twist, self._T_odom_middle @ se3_exp(self._twist * seconds)
+        twist, T = self._motion.twist, self._motion.predicted(seconds)
         for _ in range(self._config.rounds):
             match = self._front_end.match(view.prepared, T, twist)
             T = match.T_map_body
-            if seconds > 0.0:
-                twist = se3_log(se3_inverse(self._T_odom_middle) @ T) / seconds
+            twist = self._motion.twist_to(T, seconds)
         return match, twist
 
     def _is_wrong(self, match: SweepMatch, seconds: float) -> str:
@@ -218,41 +224,34 @@ class CloudTracker:
                 f"only {match.share:.0%} of {match.num_points} points lie on what is known, "
                 f"{config.min_share:.0%} needed"
             )
-        moved = se3_log(se3_inverse(self._T_odom_middle) @ match.T_map_body)
+        moved = se3_log(se3_inverse(self._motion.T_odom_middle) @ match.T_map_body)
         fast = np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])
         if fast[0] > config.fastest * max(seconds, 0.1):
             return f"it would have moved by {fast[0]:.1f} m in {seconds:.2g} s"
-        return ""
+        return self._motion.doubt(match, seconds)
 
     def _go_on(
         self, view: CloudView, match: SweepMatch, twist: Array, seconds: float, is_second: bool
     ) -> Estimate:
         """Take a match as found; the second sweep becomes a keyframe, as the first has no cloud."""
-        T_step = se3_inverse(self._T_odom_middle) @ match.T_map_body
-        step = self._step_covariance(match, seconds)
-        self._unsteady2 += LEARNING * ((twist - self._twist) ** 2 - self._unsteady2)
-        Ad = se3_adjoint(se3_inverse(T_step))
-        self._drift = Ad @ self._drift @ Ad.T + self._config.renewal * step
-        self._step = step
-        self._T_odom_middle, self._twist = match.T_map_body, twist
-        self._middle_ns = max(_middle_ns(view), self._middle_ns)
-        self._T_odom_body = self._T_odom_middle @ se3_exp(-view.middle * twist)
+        told = self._lost > 0, not self._is_mapping
+        covariance = self._motion.go(match, twist, seconds, _middle_ns(view), *told)
+        T_odom_middle = self._motion.T_odom_middle
+        self._T_odom_body = T_odom_middle @ se3_exp(-view.middle * twist)
         if self._is_mapping:
-            self._front_end.insert(view.prepared, self._T_odom_middle, twist)
+            self._front_end.insert(view.prepared, T_odom_middle, twist)
         elif self._around.is_left(self._T_odom_body):
             self._hang_anew()
         view.clock.lap("insert")
         T_keyframe_body = se3_inverse(self._T_odom_keyframe) @ self._T_odom_body
-        # By how much a motion that is not constant errs, ½ a (Δt/2)², here and at the keyframe.
-        shaken = 2.0 * np.diag(self._unsteady2) * (seconds / 8.0) ** 2
-        covariance = self._drift + step + shaken
         placed = Placed(view.frame.stamp_ns, self._keyframe, T_keyframe_body, covariance)
         status = Status.RECOVERED if self._lost else Status.TRACKING
-        self._lost = 0
+        self._lost = self._unplaced = 0
         moved = se3_log(T_keyframe_body)
         is_far = np.linalg.norm(moved[:3]) > self._config.keyframe_m
         is_turned = np.linalg.norm(moved[3:]) > self._config.keyframe_rad
-        if self._is_mapping and (is_far or is_turned or is_second):
+        is_new = is_second or self._tie == LOOP
+        if self._is_mapping and (is_far or is_turned or is_new):
             self._wanted = _Wanted(view, twist)
         return self._placed(view, placed, status, match.reason, match.num_inliers)
 
@@ -264,21 +263,27 @@ class CloudTracker:
                 view.frame.id, view.frame.stamp_ns, Status.INITIALIZING, reason, -1, identity,
                 identity, np.zeros((6, 6)), timing=view.clock.laps,
             )  # fmt: skip
-        return self._lose(view, reason)
+        return self._lose(view, reason, shows=False)
 
-    def _lose(self, view: CloudView, reason: str) -> Estimate:
+    def _lose(self, view: CloudView, reason: str, shows: bool = True) -> Estimate:
         """Say that this sweep has no pose; after many of them, begin a piece of the map."""
         self._lost += 1
-        is_long = self._lost > self._config.patience
-        if is_long and self._is_mapping and not view.says_nothing(self._config.min_points):
-            return self._begin_piece(view)
-        if self._lost >= self._config.seeks_after and view.prepared is not None:
-            seen = self._viewer.kept(view, np.zeros(6))
-            found = self._finder.find(seen, self.path.last_pose())
-            view.clock.lap("track")
-            if not isinstance(found, str):
-                return self._enter(view, found, Status.RECOVERED, np.zeros(6))
-            reason = f"{reason}; {found}"
+        if shows:
+            self._unplaced += 1
+            self._is_astray = self._is_astray or self._unplaced >= self._config.seeks_after
+            known = self._motion.twist, UNKNOWN[1]
+            if self._is_astray:
+                known = self._glimpse(view)
+            self._glimpsed = view
+            if self._lost >= self._config.seeks_after:
+                seen = self._viewer.kept(view, known[0])
+                found = self._finder.find(seen, self.path.last_pose())
+                view.clock.lap("track")
+                if not isinstance(found, str):
+                    return self._enter(view, found, Status.RECOVERED, known)
+                reason = f"{reason}; {found}"
+            if self._unplaced > self._config.patience and self._is_mapping:
+                return self._begin_piece(view)
         last = self.path.last
         return Estimate(
             view.frame.id, view.frame.stamp_ns, Status.LOST, reason, last.keyframe_id,
@@ -286,32 +291,31 @@ class CloudTracker:
             self.path.gap_covariance(view.frame.stamp_ns), timing=view.clock.laps,
         )  # fmt: skip
 
-    def _enter(self, view: CloudView, found: FoundCloud, status: Status, twist: Array) -> Estimate:
-        """Go on in the map, where a sweep was recognised, with a motion (6,)."""
+    def _enter(
+        self, view: CloudView, found: FoundCloud, status: Status, known: tuple[Array, Array]
+    ) -> Estimate:
+        """Go on in the map, where a sweep was recognised, with a motion and its information."""
         k, stamp_ns = found.keyframe_id, view.frame.stamp_ns
         T_world_keyframe = self._map.T_world_body(k)
-        self._start(view)
-        self._first, self._twist = None, twist
+        self._found(view)
+        self._first = None
         self._T_odom_body = T_world_keyframe @ found.T_keyframe_body
-        self._T_odom_middle = self._T_odom_body @ se3_exp(view.middle * twist)
-        self._keyframe, self._T_odom_keyframe = k, T_world_keyframe
-        self._drift = np.zeros((6, 6))
-        self._step = np.asarray(np.linalg.inv(found.information))
+        sure, middle = np.asarray(np.linalg.inv(found.information)), _middle_ns(view)
+        T_odom_middle = self._T_odom_body @ se3_exp(view.middle * known[0])
+        self._motion.begin(T_odom_middle, middle, sure)
+        self._motion.know(*known)
+        self._keyframe, self._T_odom_keyframe, self._tie = k, T_world_keyframe, LOOP
         self._front_end.clear()
         self._around.surround(self._front_end, self._T_odom_body)
-        placed = Placed(stamp_ns, k, found.T_keyframe_body, self._step)
-        if not self._is_mapping:
-            return self._placed(view, placed, status, "", found.num_inliers)
-        sure = self.path.covariance(placed)
-        made = self._new_keyframe(view, self._T_odom_body, sure, self._twist, parent=k)
-        self._map.add_edge(k, made, found.T_keyframe_body, found.information, LOOP)
-        placed = Placed(stamp_ns, made, np.eye(4), np.zeros((6, 6)))
+        # If nobody knows how it moves, it was found where it is in the middle of the sweep.
+        covariance = sure + self._motion.over(view.middle)
+        placed = Placed(stamp_ns, k, found.T_keyframe_body, covariance)
         return self._placed(view, placed, status, "", found.num_inliers)
 
     def _begin_piece(self, view: CloudView) -> Estimate:
         """Begin a piece of the map of which nothing is known relative to the others."""
         last, unsure = self.path.last_pose(), self.path.gap_covariance(view.frame.stamp_ns)
-        self._start(view)
+        self._found(view)
         k = self._new_keyframe(view, last, unsure)
         self._map.begin_piece(k)
         placed = Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6)))
@@ -319,25 +323,11 @@ class CloudTracker:
 
     # ---- parts ----
 
-    def _seconds_since(self, view: CloudView) -> float:
-        """Return the time since the last sweep that was placed; stamps that jump back took none."""
-        return float(np.clip((_middle_ns(view) - self._middle_ns) * 1e-9, 0.0, LONGEST_S))
-
     def _hang_anew(self) -> None:
         """Surround a body that is only placed in the map with what is there, and hang it anew."""
         self._front_end.clear()
         k = self._around.surround(self._front_end, self._T_odom_body)
         self._keyframe, self._T_odom_keyframe = k, self._map.T_world_body(k)
-        self._drift = np.zeros((6, 6))
-
-    def _step_covariance(self, match: SweepMatch, seconds: float) -> Array:
-        """Return (6, 6) of the step: what is matched, and how bodies can move at all."""
-        config = self._config
-        sigma = config.acceleration * seconds**2 + 1e-3, config.angular * seconds**2 + 1e-3
-        if self._lost:
-            sigma = sigma[0] + config.unseen * seconds, sigma[1] + config.unseen_rad * seconds
-        loose = np.diag(1.0 / np.repeat(sigma, 3) ** 2)
-        return np.asarray(np.linalg.inv(loose + match.information))
 
     def _placed(
         self, view: CloudView, placed: Placed, status: Status, reason: str, count: int
@@ -360,7 +350,8 @@ class CloudTracker:
         in_world = self.path.covariance(last)
         k = self._new_keyframe(view, self.path.last_pose(), in_world, wanted.twist)
         information = np.asarray(np.linalg.inv(last.covariance))
-        self._map.add_edge(last.keyframe_id, k, last.T_keyframe_body, information, ODOMETRY)
+        self._map.add_edge(last.keyframe_id, k, last.T_keyframe_body, information, self._tie)
+        self._tie = ODOMETRY
         self.path.replace_last(Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6))))
         return k
 
@@ -376,7 +367,7 @@ class CloudTracker:
         T_world_body[:3, :3] = orthonormalize(T_world_body[:3, :3])
         self._map.add_keyframe(keyframe, T_world_body, parent=parent, covariance=covariance)
         self._keyframe, self._T_odom_keyframe = k, self._T_odom_body
-        self._drift = np.zeros((6, 6))
+        self._motion.hang()
         self._made = k
         return k
 

@@ -28,8 +28,10 @@ Array = NDArray[np.float64]
 
 LONG = 3.0
 """Turns that a sweep may last: more, and its times are in another unit."""
-MILLION = 1e6
-"""A sweep that lasts less than a millionth of a turn is in another unit, too."""
+SHORT = 0.01
+"""Turns that a sweep all around lasts at least; one that lasts not at all came at once."""
+ALL_AROUND = 0.02
+"""Share of the points that is in each quarter around then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,11 @@ class CloudViewer:
                 f"lidar '{mount.name}': the times of a sweep's points lie {lasts:.3g} s apart, and "
                 f"a turn takes {turn:.3g} s: are they in milliseconds, or nanoseconds?"
             )
+        if 0.0 < lasts < SHORT * turn and _is_all_around(points.points):
+            return (
+                f"lidar '{mount.name}': the times of points all around lie {lasts:.3g} s apart, "
+                f"and a turn takes {turn:.3g} s: are they in seconds?"
+            )
         if not np.isfinite(points.times).all():
             return f"lidar '{mount.name}': times of points are not finite numbers"
         return ""
@@ -148,3 +155,10 @@ class CloudViewer:
         kept[:, :3] = moved @ T[:3, :3].T + T[:3, 3]
         kept[:, 3] = points.intensities[rows]
         return kept
+
+
+def _is_all_around(points: Array) -> bool:
+    """Say whether points (N, 3) lie in each quarter around the body."""
+    quarters = 2 * (points[:, 0] > 0.0) + (points[:, 1] > 0.0)
+    counts = np.bincount(quarters, minlength=4)
+    return bool(counts.min() > ALL_AROUND * len(points))

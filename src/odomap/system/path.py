@@ -277,4 +277,6 @@ def _lengths(T_from: Array, T_to: Array) -> Array:
 
 def _trajectory(stamps_ns: NDArray[np.int64], Ts: Array, covariances: Array) -> Trajectory:
     order = np.argsort(stamps_ns, kind="stable")  # clocks of old logs jump back
+    # One that jumps back may say the same twice, of which the first is kept.
+    order = order[np.diff(stamps_ns[order], prepend=stamps_ns[order][:1] - 1) > 0]
     return Trajectory(stamps_ns[order], Ts[order], covariances[order])

@@ -1,0 +1,194 @@
+"""How a body with a LiDAR moves: its twist, and how unsure that leaves where it is.
+
+Sweeps are laid where the body should be by then, x exp(ξ Δt). What a match says of the step (Λ, its
+information) is weighed against how a body can move, with V the covariance of ξ:
+
+    D = (V + diag(σ_a, σ_ω)² Δt²) Δt²,    P_step = (D⁻¹ + Λ)⁻¹,    V ← P_step / Δt²
+
+Along a tunnel Λ is zero. There ξ stays what it was, and how unsure it is grows; and as one error of
+ξ makes all steps too long, errors of steps do not average out. With A = P_step D⁻¹ the share of an
+old error that a step still has, and C the covariance of place and step,
+
+    P ← Ad P Adᵀ + P_step + C Aᵀ + A Cᵀ,    C ← Ad (C Aᵀ + P_step).
+
+Where walls fix everything A is nearly zero, and steps are independent of each other. C runs on
+through keyframes: so their covariances along a path add up to what they should.
+
+Clocks jump. A stamp before the last one tells no time: a sweep then takes as long as the last did.
+A body that was not seen for long may be anywhere, and one that was carried off is, too: then much
+less than before lies on what is known, and not where it should.
+
+Reference: T. D. Barfoot, "State estimation for robotics", Cambridge 2017, section 10.1 (a motion
+with white noise on acceleration).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
+from odomap.lidar.frontend import SweepMatch
+from odomap.system.cloudconfig import CloudTrackingConfig
+
+__all__ = ["CloudMotion"]
+
+Array = NDArray[np.float64]
+
+LEARNING = 0.1
+"""Weight of the last sweep in what is usual."""
+LONGEST_S, LONGEST = 1.0, 3.0
+"""Time over which a body is taken to go on as before; or so many times as long as it is usual."""
+LESS = 0.65
+"""Share of the points that usually lie on what is known, below which a match is looked at twice."""
+STEADY, STRANGE = (0.01, 0.003), 3.0
+"""How unsteady the steadiest motion is from sweep to sweep, metres and radians; and how many times
+what is usual is strange."""
+FIXED = 1.0
+"""Largest standard deviation of a place, in metres, that a match says something of."""
+FINEST = 1e-3
+"""Least standard deviation of a step before it is matched, metres and radians."""
+
+
+class CloudMotion:
+    """Follows a body from the middle of one sweep to the middle of the next.
+
+    Args:
+        config: how bodies move.
+
+    Attributes:
+        T_odom_middle: (4, 4) the body in the middle of the last sweep.
+        twist: (6,) per second.
+        since: (6, 6) covariance of all steps since the last keyframe.
+    """
+
+    def __init__(self, config: CloudTrackingConfig) -> None:
+        self._config = config
+        self._middle_ns = -1
+        self._usual_s = 0.0
+        self.begin(np.eye(4), -1)
+
+    def begin(self, T_odom_middle: Array, middle_ns: int, sure: Array | None = None) -> None:
+        """Begin anywhere, which is sure to a covariance (6, 6): of the motion nothing is known."""
+        config = self._config
+        self.T_odom_middle, self.twist = T_odom_middle, np.zeros(6)
+        self._V = np.diag(np.repeat([config.unknown, config.unknown_rad], 3) ** 2)
+        self._C, self.since = np.zeros((6, 6)), np.zeros((6, 6)) if sure is None else sure
+        self._unsteady2, self._usual_share = np.zeros(6), 0.0
+        self._has_gone = False
+        self._middle_ns = max(middle_ns, self._middle_ns)
+
+    @property
+    def known(self) -> tuple[Array, Array]:
+        """The twist (6,), and its information (6, 6)."""
+        return self.twist, np.asarray(np.linalg.inv(self._V))
+
+    def know(self, twist: Array, information: Array) -> None:
+        """Take notice of a twist (6,) that is known to an information (6, 6)."""
+        self.twist, self._V = twist, _together(self._V, information)
+
+    def hang(self) -> None:
+        """Count from here on: a keyframe is where the body is."""
+        self.since = np.zeros((6, 6))
+
+    def seconds_to(self, middle_ns: int) -> float:
+        """Return the time that has passed since the last sweep that was placed."""
+        seconds = (middle_ns - self._middle_ns) * 1e-9
+        return seconds if seconds > 0.0 else self._usual_s
+
+    def predicted(self, seconds: float) -> Array:
+        """Return where (4, 4) the body should be by then."""
+        return np.asarray(self.T_odom_middle @ se3_exp(self.twist * seconds))
+
+    def is_anywhere(self, seconds: float) -> bool:
+        """Say whether nobody saw it for so long that it may be anywhere by now."""
+        return self._usual_s > 0.0 and seconds > max(LONGEST_S, LONGEST * self._usual_s)
+
+    def twist_to(self, T_odom_middle: Array, seconds: float) -> Array:
+        """Return the motion per second that leads to a pose; that known if there was no time."""
+        if seconds <= 0.0:
+            return self.twist
+        return np.asarray(se3_log(se3_inverse(self.T_odom_middle) @ T_odom_middle) / seconds)
+
+    def over(self, seconds: float) -> Array:
+        """Return the covariance (6, 6) of a motion of so many seconds, as it is known."""
+        return np.asarray(self._V * seconds**2)
+
+    def doubt(self, match: SweepMatch, seconds: float) -> str:
+        """Say why a match looks as if the body was carried off; empty if it does not.
+
+        Another place has much less on what is known than those before, as has what comes in sight
+        behind a corner; but that lies where it should, and shows that it does.
+        """
+        if match.share >= LESS * self._usual_share:
+            return ""
+        off = np.abs(se3_log(se3_inverse(self.predicted(seconds)) @ match.T_map_body))
+        n = max(seconds / self._usual_s, 1.0) if self._usual_s > 0.0 else 1.0
+        longer = np.sqrt(n * (n + 1.0) * (2.0 * n + 1.0) / 6.0)  # changes of n sweeps, added up
+        usual = np.maximum(np.sqrt(self._unsteady2) * self._usual_s, np.repeat(STEADY, 3))
+        is_fixed = np.linalg.eigvalsh(match.information[:3, :3])[0] > FIXED**-2
+        if match.converged and is_fixed and (off < STRANGE * longer * usual).all():
+            return ""
+        return (
+            f"only {match.share:.0%} of {match.num_points} points lie on what is known, "
+            f"{self._usual_share:.0%} did before, and not where they should: carried off?"
+        )
+
+    def go(
+        self, match: SweepMatch, twist: Array, seconds: float, middle_ns: int, unseen: bool,
+        fixed: bool,
+    ) -> Array:  # fmt: skip
+        """Take a match as where the body is; return the covariance (6, 6) since the keyframe.
+
+        Args:
+            match: of a sweep.
+            twist: (6,) that leads there.
+            seconds: since the last one.
+            middle_ns: of the sweep.
+            unseen: whether nobody saw how it moved in between.
+            fixed: whether it was laid onto a map that is as it is, and no part of it.
+        """
+        loose = self._loose(seconds, unseen)
+        step = _together(loose, match.information)
+        kept = step @ np.linalg.inv(loose)
+        Ad = se3_adjoint(se3_inverse(se3_inverse(self.T_odom_middle) @ match.T_map_body))
+        shared = Ad @ self._C @ kept.T
+        grown = Ad @ self.since @ Ad.T + _grown(shared + shared.T)
+        if fixed:
+            grown = _together(grown + loose, match.information)
+        else:
+            grown = grown + self._config.renewal * step
+        self._C = shared + step
+        if self._has_gone:
+            self._unsteady2 += LEARNING * ((twist - self.twist) ** 2 - self._unsteady2)
+        self._has_gone = True
+        self.since = grown
+        share = self._usual_share or match.share
+        self._usual_share = share + LEARNING * (match.share - share)
+        self.T_odom_middle, self.twist = match.T_map_body, twist
+        if seconds > 0.0:
+            self._V, usual = step / seconds**2, self._usual_s or seconds
+            self._usual_s = usual + LEARNING * (seconds - usual)
+        self._middle_ns = max(middle_ns, self._middle_ns + round(seconds * 1e9))
+        # By how much a motion that is not constant errs, ½ a (Δt/2)², here and at the keyframe.
+        shaken = 2.0 * np.diag(self._unsteady2) * (seconds / 8.0) ** 2
+        return np.asarray(grown + step + shaken)
+
+    def _loose(self, seconds: float, unseen: bool) -> Array:
+        """Return the covariance (6, 6) of a step before it is matched."""
+        config = self._config
+        change = np.array([config.acceleration, config.angular]) * seconds
+        if unseen:
+            change += np.array([config.unseen, config.unseen_rad])
+        V = self._V + np.diag(np.repeat(change, 3) ** 2)
+        return np.asarray(V * seconds**2 + FINEST**2 * np.eye(6))
+
+
+def _together(loose: Array, information: Array) -> Array:
+    """Return (6, 6) of what is unsure by one covariance, and was measured with an information."""
+    sure = np.linalg.inv(np.linalg.inv(loose) + information)
+    return np.asarray(0.5 * (sure + sure.T))
+
+
+def _grown(M: Array) -> Array:
+    """Return what of a symmetric (6, 6) makes less sure: errors that undo others do not count."""
+    values, axes = np.linalg.eigh(M)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

@@ -1,0 +1,93 @@
+"""Where surfaces say little, a 3D LiDAR goes on as it did, and says how unsure it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odomap.geometry.lie import se3_inverse, se3_log
+from odomap.lidar.deskew import deskew
+from odomap.maps.estimate import Status
+from odomap.sources.wrappers import Changed
+from sweepruns import Kept, judge, played, sigmas
+
+
+@pytest.mark.parametrize(("seed", "beams", "speed"), [(0, 16, 7.5), (1, 32, 15), (4, 16, 3)])
+def test_along_a_tunnel_nothing_is_known_if_it_was_not_known_before(seed, beams, speed):
+    source = Kept("tunnel", beams, 60, seed, more=f"&speed={speed}")
+    estimates, *_ = played(source, source.rig)
+    off = judge(estimates, source.truth.Ts_world_body)
+    assert all(e.status is Status.TRACKING for e in estimates)
+    assert all("do not fix translation along (1.00, " in e.reason for e in estimates[1:])
+    sigma = sigmas(estimates)
+    assert (sigma[5:, 0] > 20.0 * sigma[5:, 1]).all()
+    assert (off[5:, 0] ** 2 / sigma[5:, 0] ** 2).mean() < 4.0
+    assert np.abs(off[:, 3:]).max() < 0.03
+
+
+def with_pillars(source, last):
+    """Show pillars on both sides until a frame: as one enters a tunnel."""
+    rng = np.random.default_rng(5)
+    Ts = source.truth.Ts_world_body
+    at = np.repeat([-7.0, -4.0, 0.0, 3.0, 8.0, 14.0, 23.0, 33.0], 250)
+    beside = rng.uniform(2.5, 4.5, len(at)) * rng.choice([-1.0, 1.0], len(at))
+    wall = np.column_stack([at, beside, rng.uniform(-1.5, 2.5, len(at))])
+    wall = wall @ Ts[0, :3, :3].T + Ts[0, :3, 3]
+
+    def change(frame):
+        if frame.id > last:
+            return frame
+        T, sweep = Ts[frame.id], frame.cloud
+        twist = 10.0 * se3_log(se3_inverse(T) @ Ts[frame.id + 1])
+        times = rng.uniform(0.0, 0.1, len(wall))
+        seen = deskew((wall - T[:3, 3]) @ T[:3, :3], times, -twist)
+        columns = {
+            "points": seen + rng.normal(0, 0.01, seen.shape), "times": times,
+            "intensities": np.ones(len(wall), np.float32), "beams": np.zeros(len(wall), np.int16),
+        }  # fmt: skip
+        joined = {n: np.concatenate([getattr(sweep, n), c]) for n, c in columns.items()}
+        return replace(frame, cloud=replace(sweep, **joined))
+
+    return Changed(source, "pillars", change)
+
+
+@pytest.mark.parametrize(("seed", "speed"), [(0, 2), (1, 4)])
+def test_in_a_tunnel_it_goes_on_as_it_came_in_and_the_covariance_grows(seed, speed):
+    source = Kept("tunnel", 16, 80, seed, more=f"&speed={speed}")
+    entered = with_pillars(source, 20)
+    estimates, _, result = played(entered, source.rig)
+    off, sigma = judge(estimates, source.truth.Ts_world_body), sigmas(estimates)
+    assert all(e.status is Status.TRACKING for e in estimates)
+    assert all(e.reason == "" for e in estimates[2:18])
+    assert all("do not fix translation" in e.reason for e in estimates[25:])
+    assert sigma[18, 0] < 0.2
+    assert sigma[60, 0] > 20.0 * sigma[18, 0]
+    way = np.linalg.norm(
+        source.truth.Ts_world_body[79, :3, 3] - source.truth.Ts_world_body[20, :3, 3]
+    )
+    assert abs(off[79, 0]) < 0.2 * way
+    assert not [loop for loop in result.loops if loop.is_accepted]  # any place is as good
+
+
+def test_in_a_field_three_ways_to_move_are_not_known():
+    source = Kept("field", 64, 40, 1)
+    estimates, *_ = played(source, source.rig)
+    judge(estimates, source.truth.Ts_world_body)
+    assert all(e.status is Status.TRACKING for e in estimates)
+    said = estimates[20].reason
+    assert said.count("translation along") == 2
+    assert "rotation about (0.0" in said
+    sigma = sigmas(estimates)[20]
+    assert sigma[[0, 1]].min() > 5.0
+    assert sigma[5] > 0.5
+    assert sigma[2] < 0.5
+    assert sigma[[3, 4]].max() < 0.1
+
+
+def test_rings_too_far_apart_to_see_a_field_claim_nothing():
+    source = Kept("field", 16, 30, 1)
+    estimates, *_ = played(source, source.rig)
+    judge(estimates, source.truth.Ts_world_body)
+    lost = [e for e in estimates[1:] if e.status is Status.LOST]
+    assert len(lost) > 20
+    assert all("lie on what is known" in e.reason or "anywhere" in e.reason for e in lost)
