@@ -91,15 +91,18 @@ class SystemChoice:
         Raises:
             CalibrationError: the rig does not carry what the settings ask for.
         """
-        import cv2
-
-        from odomap.system.odometry import make_odometry
+        from odomap.system.config import LASER, LIDAR
         from odomap.system.slam import Slam
 
-        # The stages use the cores themselves; OpenCV's own threads would only get in their way.
-        cv2.setNumThreads(1)
+        if settings.tracking.sensors not in (LASER, LIDAR):
+            import cv2
+
+            # The stages use the cores themselves; OpenCV's own threads would only be in their way.
+            cv2.setNumThreads(1)
         try:
             if self.odometry_only:
+                from odomap.system.odometry import make_odometry
+
                 return make_odometry(rig, settings, self.rhythm)
             begun = None if self.saved is None else self.saved.map
             return Slam(rig, settings, self.rhythm, begun, self.is_mapping)

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -159,11 +159,8 @@ def run(
     from odomap.savedmap import SavedMap
     from odomap.sources.source import Source
     from odomap.system.worker import deferred_interrupt
-    from odomap.viewing import check_view, watching
 
-    check_view(view)
-    if max_frames is not None and max_frames < 1:
-        raise InputError(f"max_frames is {max_frames}: at least 1 expected")
+    _check(view, max_frames)
     chosen_config(preset, config)  # a wrong name is told before anything is opened
     saved = None if map is None else SavedMap.of(map)
     choice = SystemChoice(rhythm, saved, is_mapping, odometry_only)
@@ -179,7 +176,7 @@ def run(
     logbook = Logbook(_expected(source, max_frames))
     system = choice.make(source.rig, settings, head["data"])
     logbook.map, logbook.loops = None if odometry_only else system.map, LoopBook.of(system.worker)
-    shown = watching(view, system, source.rig, settings)
+    shown = _watching(view, system, source.rig, settings)
     compile_s = _warm_up(tell)
     with deferred_interrupt() as interrupt, closing(system.worker), shown as see:
         try:
@@ -229,10 +226,31 @@ def chosen_config(
     return override(chosen, overrides)
 
 
+def _check(view: "View | bool", max_frames: int | None) -> None:
+    """Make sure that a view can be opened, where one is to be, and that frames are asked for."""
+    if view is True:
+        from odomap.viewing import check_view
+
+        check_view(view)
+    if max_frames is not None and max_frames < 1:
+        raise InputError(f"max_frames is {max_frames}: at least 1 expected")
+
+
 def _opened(data: str | Path, rig: "Rig | str | Path | None") -> "Source":
     from odomap.sources.open import open as open_source
 
     return open_source(data, rig)
+
+
+def _watching(
+    view: "View | bool", system: "System", rig: "Rig", config: "Config"
+) -> AbstractContextManager["Callable[[Frame], object]"]:
+    """Let a view watch a run; where nobody looks, what draws is not even loaded."""
+    if view is False:
+        return nullcontext(lambda _: None)
+    from odomap.viewing import watching
+
+    return watching(view, system, rig, config)
 
 
 def _warm_up(tell: Callable[[Progress], None]) -> float:

@@ -21,7 +21,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,12 +309,12 @@ def check_view(view: View | bool) -> None:
 
 @contextmanager
 def watching(
-    view: View | bool, system: Watched, rig: Rig, config: "Config"
+    view: View | Literal[True], system: Watched, rig: Rig, config: "Config"
 ) -> Iterator[Callable[[Frame], object]]:
     """Let a view watch a run; one that is made here ends with it.
 
     Args:
-        view: a view, True for one of its own, False for none.
+        view: a view, True for one of its own.
         system: what tracks.
         rig: of the frames.
         config: of the system.
@@ -322,10 +322,7 @@ def watching(
     Yields:
         What to call with each frame before it is tracked.
     """
-    if view is False:
-        yield lambda _: None
-        return
-    shown = View() if view is True else view
+    shown = View() if isinstance(view, bool) else view
     try:
         shown.watch(system, rig, config)
         yield shown.see

@@ -53,8 +53,8 @@ REFINED = 6
 STEPS = 20
 LONGEST = 2.0, 0.1
 """Most that a step may be: in cells, in radians."""
-ENOUGH = 1e-3, 1e-6
-"""What a step may be to be the last: in cells, in radians."""
+ENOUGH, FINE = (5e-3, 2e-5), (1e-3, 1e-6)
+"""What a step may be to be the last: in cells, in radians; and where places in cells are known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +366,7 @@ def refine_kernel(
             return
         for k in range(3):
             x[k] += step[k]
-        if np.hypot(step[0], step[1]) < ENOUGH[0] * resolution and abs(step[2]) < ENOUGH[1]:
+        if np.hypot(step[0], step[1]) < FINE[0] * resolution and abs(step[2]) < FINE[1]:
             return
 
 

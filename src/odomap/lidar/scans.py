@@ -29,7 +29,7 @@ from odomap.kernels import kernel
 from odomap.lidar.scanconfig import ScanConfig
 from odomap.sensors.rig import LidarMount
 
-__all__ = ["Beams", "ScanPoints"]
+__all__ = ["Beams", "ScanPoints", "ScanRays"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,32 +37,53 @@ Count = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class ScanPoints:
-    """A scan in the plane of the body.
+class ScanRays:
+    """What a scan tells of what is free and what is not, in the plane of the body.
 
     Attributes:
         origin: (2,) the scanner.
         hits: (N, 2) where beams came back from, metres.
-        normals: (N, 2) of unit length across the surfaces there, zero where there is none.
-        weights: (N,) how much each says: less than 1 for those of no surface far away, which may be
-            anywhere between beams.
         between: (M, 2) points on the surfaces between them.
         free: (F, 2) how far the way is free where nothing came back.
-        num_beams: beams of the scanner.
-        num_invalid: those that said nothing: NaN.
     """
 
     origin: Array
     hits: Array
-    normals: Array
-    weights: Array
     between: Array
     free: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPoints(ScanRays):
+    """A scan in the plane of the body, to be laid onto others.
+
+    Attributes:
+        normals: (N, 2) of unit length across the surfaces hit, zero where there is none.
+        weights: (N,) how much each says: less than 1 for those of no surface far away, which may be
+            anywhere between beams.
+        num_beams: beams of the scanner.
+        num_invalid: those that said nothing: NaN.
+    """
+
+    normals: Array
+    weights: Array
     num_beams: int
     num_invalid: int
 
     def __len__(self) -> int:
         return len(self.hits)
+
+
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Ends of beams (beams, 2), which of them came back, which are of one surface with the next,
+    points between these (M, 2), and where the way is free to (F, 2)."""
+
+    p: Array
+    is_hit: Mask
+    is_one: Mask
+    between: Array
+    free: Array
 
 
 class Beams:
@@ -92,8 +113,8 @@ class Beams:
     def __len__(self) -> int:
         return len(self._directions)
 
-    def points(self, ranges: Array) -> ScanPoints:
-        """Return a scan as points.
+    def rays(self, ranges: Array) -> ScanRays:
+        """Return what a scan tells of what is free and what is not.
 
         Args:
             ranges: (beams,) metres, NaN where invalid, inf where nothing came back.
@@ -101,10 +122,35 @@ class Beams:
         Raises:
             ValueError: it has another number of beams.
         """
+        ranges, laid = self._laid(ranges)
+        return ScanRays(self._origin, laid.p.compress(laid.is_hit, 0), laid.between, laid.free)
+
+    def points(self, ranges: Array) -> ScanPoints:
+        """Return a scan as points; argument and errors as those of `rays`."""
+        ranges, laid = self._laid(ranges)
+        config, normals = self.config, np.zeros((len(self), 2))
+        along = config.baseline, np.cos(config.bend)
+        find_normals(laid.p, laid.is_hit, laid.is_one, *along, normals)
+        normals = normals.compress(laid.is_hit, 0)
+        apart = self._step * ranges.compress(laid.is_hit)
+        of_none = ~normals.any(axis=1)
+        return ScanPoints(
+            origin=self._origin,
+            hits=laid.p.compress(laid.is_hit, 0),
+            between=laid.between,
+            free=laid.free,
+            normals=normals,
+            weights=np.where(of_none, np.minimum(1.0, (config.grain / apart) ** 2), 1.0),
+            num_beams=len(ranges),
+            num_invalid=int(np.count_nonzero(np.isnan(ranges))),
+        )
+
+    def _laid(self, ranges: Array) -> tuple[Array, "_Laid"]:
+        """Return ranges that kernels may read, and beams laid onto the body."""
         if ranges.shape != (len(self),):
             raise ValueError(f"a scan of {len(ranges)} beams, expected {len(self)}")
         ranges, config = np.array(ranges, np.float64), self.config  # kernels want it writable
-        p, normals = np.empty((len(self), 2)), np.zeros((len(self), 2))
+        p = np.empty((len(self), 2))
         is_hit, is_one = np.empty(len(self), bool), np.empty(max(len(self) - 1, 0), bool)
         parts = np.empty(len(is_one), np.int64)
         beams = self._directions, self._origin, self._step
@@ -114,21 +160,7 @@ class Beams:
         )
         between = np.empty((count, 2))
         fill_between(p, parts, between)
-        find_normals(p, is_hit, is_one, config.baseline, np.cos(config.bend), normals)
-        hits, normals = p.compress(is_hit, 0), normals.compress(is_hit, 0)
-        apart = self._step * ranges.compress(is_hit)
-        of_none = ~normals.any(axis=1)
-        weights = np.where(of_none, np.minimum(1.0, (config.grain / apart) ** 2), 1.0)
-        return ScanPoints(
-            origin=self._origin,
-            hits=hits,
-            normals=normals,
-            weights=weights,
-            between=between,
-            free=self._free(ranges),
-            num_beams=len(ranges),
-            num_invalid=int(np.count_nonzero(np.isnan(ranges))),
-        )
+        return ranges, _Laid(p, is_hit, is_one, between, self._free(ranges))
 
     def nothing(self) -> ScanPoints:
         """Return a scan that says nothing."""

@@ -204,7 +204,7 @@ def _grid_of_scans(
                 f"a scan of the map has {len(ranges)} beams, '{mount.name}' of the rig has "
                 f"{len(beams)}: give the rig that the map was made with"
             )
-        seen = beams.points(ranges)
+        seen = beams.rays(ranges)
         R, t = T[:2, :2].T, T[:2, 3]
         parts = {"between": seen.between @ R + t, "free": seen.free @ R + t}
         grid.insert(seen.origin @ R + t, seen.hits @ R + t, **parts)

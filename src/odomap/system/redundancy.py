@@ -112,7 +112,7 @@ class _Look:
         owners = np.setdiff1d(owners[owners < before], gone)
         if len(owners) < config.covers or scan is None:
             return False
-        hits = self._beams.points(scan).hits[::EVERY]
+        hits = self._beams.rays(scan).hits[::EVERY]
         hits = hits[np.hypot(*hits.T) < FARTHEST]
         shown = 0
         for left, n in zip(range(len(owners), 0, -1), owners.tolist()):

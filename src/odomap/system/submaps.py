@@ -34,7 +34,7 @@ from odomap.geometry.planar import (
 )
 from odomap.lidar.fusion import fused
 from odomap.lidar.grid import Evidence, OccupancyGrid
-from odomap.lidar.scans import Beams, ScanPoints
+from odomap.lidar.scans import Beams, ScanRays
 from odomap.maps.map import Map
 from odomap.system.scanconfig import SubmapConfig
 from odomap.system.scanpieces import Pieces
@@ -73,7 +73,7 @@ class Submap:
     drift: Array = field(default_factory=lambda: np.zeros((3, 3)))
     places: list[tuple[Array, Array]] = field(default_factory=list)
 
-    def insert(self, keyframe_id: int, scan: ScanPoints, x_anchor_body: Array) -> None:
+    def insert(self, keyframe_id: int, scan: ScanRays, x_anchor_body: Array) -> None:
         """Add the scan of a keyframe."""
         parts = scan.hits, scan.between, scan.free, scan.origin[None]
         points = transform_planar(x_anchor_body, np.concatenate(parts))
@@ -132,7 +132,7 @@ class Submaps:
         self.held: list[Submap] = []
         self.pieces = Pieces(map)
 
-    def add(self, keyframe_id: int, scan: ScanPoints, drift: Array) -> None:
+    def add(self, keyframe_id: int, scan: ScanRays, drift: Array) -> None:
         """Add a keyframe's scan where the active submaps have the body; begin and finish them.
 
         Args:
@@ -232,7 +232,7 @@ class Submaps:
             for k, x in members_at:
                 scan = self._map.keyframe(k).scan if self._map.is_keyframe_alive(k) else None
                 if scan is not None:
-                    submap.insert(k, beams.points(scan), x)
+                    submap.insert(k, beams.rays(scan), x)
             submap.grid = submap.grid.finished()
             self.finished.append(submap)
 

@@ -123,7 +123,7 @@ class ScanReturns:
         # A scan of another number of beams is refused by the tracker, which says so.
         if ranges is None or ranges.shape != (len(self._beams),):
             return np.zeros((0, 3))
-        hits = self._beams.points(ranges).hits
+        hits = self._beams.rays(ranges).hits
         return np.asarray(self._T_laser_body @ np.c_[hits, np.full(len(hits), self._height)])
 
 
