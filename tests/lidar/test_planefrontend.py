@@ -152,3 +152,22 @@ def test_voxels_are_as_large_as_a_place_is_wide():
     assert suitable_voxel(5.0 * points, config) == pytest.approx(0.5)
     assert suitable_voxel(0.1 * points, config) == config.least_voxel
     assert suitable_voxel(99.0 * points, config) == config.most_voxel
+
+
+@pytest.mark.parametrize("yaw", [-0.03, 0.02])
+def test_before_a_wall_far_ahead_a_turn_is_no_step_to_the_side(yaw):
+    rng = np.random.default_rng(3)
+
+    def street_end(n=8000):
+        wall = np.column_stack([np.full(n, 30.0), *rng.uniform((-14, 0), (14, 8), (n, 2)).T])
+        ground = np.column_stack([*rng.uniform((4, -14), (30, 14), (n, 2)).T, np.zeros(n)])
+        return np.concatenate([wall, ground]) + rng.normal(0, 0.01, (2 * n, 3))
+
+    front_end = PlaneFrontEnd(PointsConfig(voxel=0.8))
+    front_end.insert(front_end.prepare(sweep(street_end())), np.eye(4), np.zeros(6))
+    T = se3_exp(np.array([0, 0, 0, 0, 0, yaw]))
+    match = front_end.match(front_end.prepare(taken_from(T, street_end())), np.eye(4), np.zeros(6))
+    off = se3_log(se3_inverse(T) @ match.T_map_body)
+    assert "degenerate" in match.reason
+    assert np.abs(off[:3]).max() < 0.1  # and not 30 m times the turn
+    assert np.abs(off[3:]).max() < 0.005

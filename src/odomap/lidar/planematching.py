@@ -15,8 +15,9 @@ Those of one voxel share the error of its mean and normal; who uses H says how m
 
 Normals are noisy, and a thousand that are tilted by chance hold a body along a tunnel, where the
 rings of its beams lie now. So what tilts pretend is taken off H, and where little is left, nothing
-is known (`degeneracy`). Such directions, W, are held at the guess: in the metric K of how points
-move, H gets β K W (Wᵀ K W)⁻¹ Wᵀ K, with β large.
+is known (`degeneracy`). Along such directions, W, it stays as near to the guess as it can: in the
+metric M of how bodies move, H gets β M W (Wᵀ M W)⁻¹ Wᵀ M, with β large. Not in that of how points
+move: before a wall far ahead, which fixes yaw, a body would go sideways for its points to stay.
 
 Cost: 0.25 µs a point and step, 4 to 10 steps, and 0.3 ms for what is known.
 
@@ -71,6 +72,8 @@ LEAST = 1e-9
 """Share of how points move that a motion moves them by at least, as turning about their line."""
 HELD = 1e4
 """β, where a motion is seen by 1 at most."""
+LEVER = 2.0
+"""Metres that a body is moved as easily as it is turned by a radian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +291,8 @@ def _holding(motion: Array, weak: Array) -> Array:
     """Return what (21,) is added to H for the tangents (K, 6) to be held."""
     if not len(weak):
         return np.zeros(21)
-    moved = motion @ weak.T
+    unlikely = motion[0, 0] * np.diag(np.repeat([1.0, LEVER**2], 3))
+    moved = unlikely @ weak.T
     held = HELD * moved @ np.linalg.solve(weak @ moved, moved.T)
     return np.asarray(held[np.triu_indices(6)])
 
