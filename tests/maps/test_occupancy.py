@@ -175,3 +175,34 @@ def test_which_way_is_up_follows_from_the_sensors():
     with_imu = Rig(imu=ImuMount(), lidars=(LidarMount("top", turned),))
     np.testing.assert_allclose(upwards(with_imu), [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(upwards(Rig(lidars=(LidarMount("top", turned),))), [0, 0, 1])
+
+
+def test_on_a_street_that_falls_the_ground_is_free_and_a_wall_is_not():
+    m, rng = Map(), np.random.default_rng(0)
+    rig = Rig(lidars=(LidarMount("top", range_m=(0.5, 60.0), beams=16),))
+    for x in np.arange(0.0, 60.0, 3.0):
+        xy = rng.uniform(-15, 15, (6000, 2)) + np.array([x, 0.0])
+        ground = np.column_stack([xy, height(xy) + rng.normal(0, 0.02, len(xy))])
+        wall = np.column_stack([rng.uniform(x - 15, x + 15, 2000), np.full(2000, 6.0)])
+        wall = np.column_stack([wall, height(wall) + rng.uniform(0, 3, 2000)])
+        there = np.concatenate([ground[np.hypot(*(ground[:, :2] - (x, 0)).T) > 3], wall])
+        T = np.eye(4)
+        T[:3, 3] = x, 0, height(np.array([[x, 0.0]]))[0] + 1.7
+        cloud = (there - T[:3, 3]).astype(np.float32)
+        k = m.new_keyframe_id()
+        m.add_keyframe(Keyframe(k, int(x * 1e9), cloud=cloud), T)
+    made = grid_of_map(m, rig, GridConfig(resolution=0.2))
+    assert made.notes == (
+        "the ground is not one plane: heights are counted from the lowest points around",
+    )
+    centres = occupied(made.grid)
+    assert np.mean(np.abs(centres[:, 1] - 6.0) < 0.25) > 0.95
+    x, y = np.meshgrid(np.arange(0, 57, 0.5), np.arange(-5, 5, 0.5))
+    assert made.grid.probability(np.column_stack([x.ravel(), y.ravel()])).max() < 0.5
+    asked = grid_of_map(m, rig, GridConfig(resolution=0.2, up="ground"))
+    assert is_as(asked.grid, made.grid)
+
+
+def height(xy):
+    """Return the height of a street that falls by 6 m on its way, and bends."""
+    return -0.1 * xy[:, 0] + 0.4 * np.sin(xy[:, 0] / 10.0)

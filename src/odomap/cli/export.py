@@ -44,8 +44,9 @@ class Export:
     """What is in the way, metres above the floor; of clouds and depth."""
     floor: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """How far the floor is below the sensor; default by what was seen."""
-    up: Literal["gravity", "body"] = "gravity"
-    """What heights are counted along: body for what drives on wheels, up ramps, too."""
+    up: Literal["gravity", "body", "ground"] = "gravity"
+    """What heights are counted from: a level floor; body for a floor that goes with what drives on
+    wheels, up ramps, too; ground that rises and falls, which clouds without one floor have, too."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File for the points: PLY, coloured; of a LiDAR PLY or PCD, with intensities."""
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -8,7 +8,10 @@ keyframe is one scan. A 2D scan is laid at T_world_body, of which the plane keep
 a 3D sweep or a depth image is sliced (`lidar/slices`): heights are above a floor, which is a plane
 
     of the world (up = "gravity"): one for all keyframes, for sensors held by hand as well;
-    of the body (up = "body"):     what stands on wheels takes its floor with it, up a ramp.
+    of the body (up = "body"):     what stands on wheels takes its floor with it, up a ramp;
+
+or, of clouds, the ground as it rises and falls (up = "ground", `lidar/terrain`), which is taken too
+where gravity is asked for and one plane is not the floor of all: streets are not level.
 
 Upwards is z of the world, or, where the body is a camera, away from its image's lower border, on
 average; the plane is found in the points themselves. x and y of the grid are the world's, where the
@@ -31,6 +34,7 @@ from odomap.lidar.grid import Evidence, OccupancyGrid
 from odomap.lidar.scanconfig import ScanConfig
 from odomap.lidar.scans import Beams
 from odomap.lidar.slices import SliceConfig, find_floor, level, slice_sweep
+from odomap.lidar.terrain import Terrain, terrain_of
 from odomap.limits import Positive, check_limits
 from odomap.maps.atlas import Atlas
 from odomap.maps.map import Map
@@ -49,12 +53,13 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-UPS = ("gravity", "body")
+UPS = ("gravity", "body", "ground")
 LEVEL = np.cos(np.deg2rad(10.0))
 LOOKED_AT, POINTS_EACH = 24, 1000
 """Sweeps in which the floor is looked for, and points of each."""
 LOWEST = 0.02
 """Share of the points below the floor where no plane is found."""
+RISES = "the ground is not one plane: heights are counted from the lowest points around"
 
 
 @dataclass(frozen=True)
@@ -70,10 +75,11 @@ class GridConfig:
     slice: SliceConfig = field(default_factory=SliceConfig)
     """What of a cloud is in the way."""
     up: str = "gravity"
-    """What heights are counted along: "gravity" or "body"."""
+    """What heights are counted from and along: a floor, "gravity" or "body", or "ground" that rises
+    and falls."""
     floor: float | None = None
     """How far it is below the sensor, in the middle of all, metres; None looks for it in the points
-    seen. To be given where a table is seen and the floor under it is not."""
+    seen. To be given where a table is seen and the floor under it is not; not for "ground"."""
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -248,6 +254,8 @@ def grid_of_sweeps(
     """
     config = GridConfig() if config is None else config
     ground, notes = _find_ground(sweeps() if some is None else some, up_body, config)
+    if config.up == "ground" or (ground.is_guessed and made_of == "clouds"):
+        ground, notes = _with_terrain(ground, sweeps, config.slice.farthest), (RISES,)
     grid = OccupancyGrid(config.resolution, config.evidence)
     path = []
     for sweep in sweeps():
@@ -268,12 +276,16 @@ class _Ground:
         up: (3,) what heights are counted along, of the world or of the body.
         height: of the floor along it.
         of_body: whether these are the body's.
+        is_guessed: whether no floor was found and none given.
+        terrain: heights of the ground in that frame, or None where it is one plane.
     """
 
     T_level_world: Array
     up: Array
     height: float
     of_body: bool
+    is_guessed: bool = False
+    terrain: Terrain | None = None
 
     def above(self, sweep: Sweep, points_body: Array) -> Array:
         """Return x and y in the plane and z above the floor of points (..., 3)."""
@@ -282,7 +294,23 @@ class _Ground:
         placed = points_world @ self.T_level_world[:3, :3].T
         measured = points_body if self.of_body else points_world
         placed[..., 2] = measured @ self.up - self.height
+        if self.terrain is not None:
+            placed[..., 2] -= np.nan_to_num(self.terrain.at(placed[..., :2]))
         return np.asarray(placed)
+
+
+def _with_terrain(
+    ground: _Ground, sweeps: Callable[[], Iterable[Sweep]], farthest: float
+) -> _Ground:
+    """Return the same with the heights of the ground that all sweeps see, near where they are."""
+
+    def near() -> Iterator[Array]:
+        for sweep in sweeps():
+            placed, eye = (ground.above(sweep, p) for p in (sweep.points_body, sweep.eye_body))
+            yield placed[np.square(placed[:, :2] - eye[:2]).sum(axis=1) < farthest**2]
+
+    places = [sweep.T_world_body[:3, 3] for sweep in sweeps()]
+    return replace(ground, terrain=terrain_of(near(), float(np.ptp(places, axis=0).max())))
 
 
 def _find_ground(
@@ -314,7 +342,8 @@ def _find_ground(
     plane = up_world if of_body else up
     plane = np.array([0.0, 0.0, 1.0]) if plane[2] > LEVEL else plane
     T_level_world = level(plane, 0.0 if of_body else height)
-    return _Ground(T_level_world, up, height, of_body), tuple(notes)
+    is_guessed = found is None and config.floor is None
+    return _Ground(T_level_world, up, height, of_body, is_guessed), tuple(notes)
 
 
 def _some(sweeps: Iterable[Sweep]) -> list[Sweep]:
