@@ -30,9 +30,9 @@ class Kept(SimulatedSource):
         return (self.frame(k) for k in range(len(self)))
 
 
-def errors(estimates, true):
+def errors(estimates, true, first=None):
     """Return by how much (N, 6) estimates are off true poses, seen from the first, in the body."""
-    first = se3_inverse(true[0])
+    first = se3_inverse(true[0] if first is None else first)
     pairs = zip(estimates, true, strict=True)
     return np.array([se3_log(se3_inverse(first @ T) @ e.T_world_body.matrix) for e, T in pairs])
 
@@ -41,9 +41,9 @@ def sigmas(estimates):
     return np.sqrt([np.diag(e.covariance) for e in estimates])
 
 
-def judge(estimates, true, least=LEAST):
+def judge(estimates, true, least=LEAST, first=None):
     """Check what is claimed, (N,) estimates against (N, 4, 4) poses."""
-    off = errors(estimates, true)
+    off = errors(estimates, true, first)
     for e, x, sigma in zip(estimates, off, sigmas(estimates), strict=True):
         assert np.isfinite(e.covariance).all()
         assert np.linalg.eigvalsh(e.covariance).min() >= -1e-9 * np.trace(e.covariance)

@@ -23,7 +23,7 @@ from odomap.lidar.degeneracy import named
 from odomap.lidar.deskew import deskew
 from odomap.lidar.frontend import SweepMatch
 from odomap.lidar.planemap import PlaneMap
-from odomap.lidar.planematching import PlaneMatch, match_planes
+from odomap.lidar.planematching import PlaneMatch, lying, match_planes
 from odomap.lidar.sweeps import SweepPoints
 from odomap.lidar.voxels import first_in_voxels
 
@@ -82,6 +82,15 @@ class PlaneFrontEnd:
             _reason(found, points),
         )  # fmt: skip
 
+    def lying(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> SweepMatch:
+        """Say how a sweep lies where it is, and find nothing; arguments as those of `match`."""
+        rows = prepared.matched
+        points = deskew(prepared.points[rows], prepared.times[rows], twist)
+        surfaces = self._surfaces()
+        on, mean = lying(surfaces, points, T_map_body)
+        error = surfaces.sigma * float(np.sqrt(mean))
+        return SweepMatch(T_map_body, np.zeros((6, 6)), on, len(points), error, True)
+
     def _note(self, T_guess: Array, T: Array, points: Array) -> None:
         """Learn from how far the guess was off."""
         xi = se3_log(se3_inverse(T_guess) @ T)
@@ -96,6 +105,10 @@ class PlaneFrontEnd:
         surfaces.insert(points @ T_map_body[:3, :3].T + T_map_body[:3, 3])
         surfaces.evict(T_map_body[:3, 3], self._config.farthest * surfaces.voxel)
 
+    def expect_anything(self) -> None:
+        """Take the next guess to be as far off as the first may be."""
+        self._off2 = self._config.first_off**2
+
     def seed(self, points: Array) -> None:
         """Add points (N, 3) of another map, in the frame of this one."""
         self._surfaces().insert(points)
@@ -107,7 +120,8 @@ class PlaneFrontEnd:
 
     def clear(self) -> None:
         """Forget the map."""
-        self._map, self._off2 = None, self._config.first_off**2
+        self._map = None
+        self.expect_anything()
 
 
 def _reason(found: PlaneMatch, points: Array) -> str:

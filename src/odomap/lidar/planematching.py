@@ -45,7 +45,7 @@ from odomap.lidar.planemap import (
 )
 from odomap.lidar.voxels import key_of, slot_of
 
-__all__ = ["match_planes"]
+__all__ = ["PlaneMatch", "lying", "match_planes"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -264,6 +264,21 @@ def match_planes(surfaces: PlaneMap, points: Array, T_map_body: Array, wide: flo
     return match
 
 
+def lying(surfaces: PlaneMap, points: Array, T_map_body: Array) -> tuple[int, float]:
+    """Return how many points lie on surfaces where they are, and their mean square, in variances.
+
+    Args:
+        surfaces: of sweeps before.
+        points: (N, 3) seen from the body at one instant.
+        T_map_body: (4, 4) of the body.
+    """
+    s, total = surfaces, np.zeros(SLOTS)
+    R, t = np.ascontiguousarray(T_map_body[:3, :3]), np.array(T_map_body[:3, 3])
+    arrays = s.voxel, s.table, s.keys, s.sums, s.flags, s.means, s.normals, s.sigma**2
+    on = _sum_kernel(points, R, t, *arrays, NARROW, total)
+    return on, float(total[COST] / max(total[COUNT], 1e-9))
+
+
 def _match(
     surfaces: PlaneMap, points: Array, T_map_body: Array, wide: float, hold: Array
 ) -> tuple[PlaneMatch, Array]:
@@ -310,3 +325,4 @@ def warm_up() -> None:
     points = np.array([[x, y, 0.01 * x * y] for x in range(7) for y in range(7)]) / 7.0
     surfaces.insert(points)
     match_planes(surfaces, points, np.eye(4), 9.0)
+    lying(surfaces, points, np.eye(4))

@@ -14,13 +14,16 @@ old error that a step still has, and C the covariance of place and step,
 Where walls fix everything A is nearly zero, and steps are independent of each other. C runs on
 through keyframes: so their covariances along a path add up to what they should.
 
-Clocks jump. A stamp before the last one tells no time: a sweep then takes as long as the last did.
+Clocks jump. A stamp before the last one, or hardly after it, tells no time: a sweep then takes as
+long as is usual.
 A body that was not seen for long may be anywhere, and one that was carried off is, too: then much
 less than before lies on what is known, and not where it should.
 
 Reference: T. D. Barfoot, "State estimation for robotics", Cambridge 2017, section 10.1 (a motion
 with white noise on acceleration).
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +32,7 @@ from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
 from odomap.lidar.frontend import SweepMatch
 from odomap.system.cloudconfig import CloudTrackingConfig
 
-__all__ = ["CloudMotion"]
+__all__ = ["CloudMotion", "is_fixed"]
 
 Array = NDArray[np.float64]
 
@@ -37,15 +40,48 @@ LEARNING = 0.1
 """Weight of the last sweep in what is usual."""
 LONGEST_S, LONGEST = 1.0, 3.0
 """Time over which a body is taken to go on as before; or so many times as long as it is usual."""
+SHORTEST = 0.1
+"""Of the usual time between sweeps: in less no sweep is taken, and no speed can be told of it."""
 LESS = 0.65
 """Share of the points that usually lie on what is known, below which a match is looked at twice."""
-STEADY, STRANGE = (0.01, 0.003), 3.0
+STEADY, STRANGE = (0.01, 0.003), 4.0
 """How unsteady the steadiest motion is from sweep to sweep, metres and radians; and how many times
 what is usual is strange."""
 FIXED = 1.0
 """Largest standard deviation of a place, in metres, that a match says something of."""
+LEARNT = 5
+"""Sweeps after which it is known how unsteady a motion is."""
+AFTERWARDS = 2
+"""Sweeps after a strange motion, which are looked at twice, too."""
+POOR, FEWER, WORSE = 3.0, 0.05, 0.17
+"""How many times what is usual a match is worse that is poor; by what share the number of points on
+the map differs from sweep to sweep at least, and their misfit."""
+TRUNCATED = 9.0
+"""Squares of the usual error from which on points lie on nothing."""
 FINEST = 1e-3
 """Least standard deviation of a step before it is matched, metres and radians."""
+
+
+@dataclass
+class _Usual:
+    """What a number usually is, and the square of by how much it differs from sweep to sweep."""
+
+    value: float = 0.0
+    square: float = 0.0
+    learnt: int = 0
+
+    def learn(self, now: float) -> None:
+        """Take in one more, which counts as much as any as long as they are few."""
+        self.learnt += 1
+        weight, off = max(LEARNING, 1.0 / self.learnt), now - self.value
+        self.value += weight * off
+        if self.learnt > 1:
+            self.square += weight * (off * off - self.square)
+
+    def above(self, now: float, least: float) -> float:
+        """Return by how many times what is usual it is above, which is a share of it at least."""
+        spread = max(self.square**0.5, least * self.value)
+        return (now - self.value) / spread if spread > 0.0 else 0.0
 
 
 class CloudMotion:
@@ -72,8 +108,9 @@ class CloudMotion:
         self.T_odom_middle, self.twist = T_odom_middle, np.zeros(6)
         self._V = np.diag(np.repeat([config.unknown, config.unknown_rad], 3) ** 2)
         self._C, self.since = np.zeros((6, 6)), np.zeros((6, 6)) if sure is None else sure
-        self._unsteady2, self._usual_share = np.zeros(6), 0.0
-        self._has_gone = False
+        self._unsteady2 = np.zeros(6)
+        self._share, self._square, self._count, self._misfit = (_Usual() for _ in range(4))
+        self._gone, self._shaken, self._was_fixed = 0, 0, False
         self._middle_ns = max(middle_ns, self._middle_ns)
 
     @property
@@ -92,7 +129,7 @@ class CloudMotion:
     def seconds_to(self, middle_ns: int) -> float:
         """Return the time that has passed since the last sweep that was placed."""
         seconds = (middle_ns - self._middle_ns) * 1e-9
-        return seconds if seconds > 0.0 else self._usual_s
+        return seconds if seconds > SHORTEST * self._usual_s else self._usual_s
 
     def predicted(self, seconds: float) -> Array:
         """Return where (4, 4) the body should be by then."""
@@ -112,25 +149,53 @@ class CloudMotion:
         """Return the covariance (6, 6) of a motion of so many seconds, as it is known."""
         return np.asarray(self._V * seconds**2)
 
+    def is_strange(self, match: SweepMatch, seconds: float) -> bool:
+        """Say whether a match is not like those before, or the motion was not a moment ago."""
+        if not self._gone:
+            return False
+        slides = self._was_fixed and not is_fixed(match)
+        is_odd = not match.converged or slides or self._shaken > 0 or self.is_poor(match)
+        return is_odd or self._is_off(match, seconds)
+
+    def is_poor(self, match: SweepMatch) -> bool:
+        """Say whether fewer points lie on the map than usual, or less well."""
+        is_less = self._count.above(match.num_inliers, FEWER) < -POOR
+        return is_less or self._misfit.above(self._misfit_of(match), WORSE) > POOR
+
+    def _misfit_of(self, match: SweepMatch) -> float:
+        """Return Σ min(r², 9 σ²) with σ the usual error, relative to what it usually is."""
+        share, usual, square = match.share, self._share.value, self._square.value
+        if not square > 0.0:
+            return 1.0
+        misfit = share * match.error**2 / square + (1.0 - share) * TRUNCATED
+        return misfit / (usual + (1.0 - usual) * TRUNCATED)
+
     def doubt(self, match: SweepMatch, seconds: float) -> str:
         """Say why a match looks as if the body was carried off; empty if it does not.
 
         Another place has much less on what is known than those before, as has what comes in sight
         behind a corner; but that lies where it should, and shows that it does.
         """
-        if match.share >= LESS * self._usual_share:
+        if match.share >= LESS * self._share.value:
             return ""
-        off = np.abs(se3_log(se3_inverse(self.predicted(seconds)) @ match.T_map_body))
-        n = max(seconds / self._usual_s, 1.0) if self._usual_s > 0.0 else 1.0
-        longer = np.sqrt(n * (n + 1.0) * (2.0 * n + 1.0) / 6.0)  # changes of n sweeps, added up
-        usual = np.maximum(np.sqrt(self._unsteady2) * self._usual_s, np.repeat(STEADY, 3))
-        is_fixed = np.linalg.eigvalsh(match.information[:3, :3])[0] > FIXED**-2
-        if match.converged and is_fixed and (off < STRANGE * longer * usual).all():
+        if match.converged and is_fixed(match) and self._off(match, seconds) < STRANGE:
             return ""
         return (
             f"only {match.share:.0%} of {match.num_points} points lie on what is known, "
-            f"{self._usual_share:.0%} did before, and not where they should: carried off?"
+            f"{self._share.value:.0%} did before, and not where they should: carried off?"
         )
+
+    def _is_off(self, match: SweepMatch, seconds: float) -> bool:
+        """Say whether a match is far from where it should be, as soon as it is known how far is."""
+        return self._gone > LEARNT and self._off(match, seconds) > STRANGE
+
+    def _off(self, match: SweepMatch, seconds: float) -> float:
+        """Return how far a match is from where it should be, in units of how far is usual."""
+        off = _sizes(se3_log(se3_inverse(self.predicted(seconds)) @ match.T_map_body))
+        n = max(seconds / self._usual_s, 1.0) if self._usual_s > 0.0 else 1.0
+        longer = np.sqrt(n * (n + 1.0) * (2.0 * n + 1.0) / 6.0)  # changes of n sweeps, added up
+        usual = np.maximum(_sizes(np.sqrt(self._unsteady2)) * self._usual_s, STEADY)
+        return float(np.max(off / (longer * usual)))
 
     def go(
         self, match: SweepMatch, twist: Array, seconds: float, middle_ns: int, unseen: bool,
@@ -157,16 +222,20 @@ class CloudMotion:
         else:
             grown = grown + self._config.renewal * step
         self._C = shared + step
-        if self._has_gone:
+        is_off = self._is_off(match, seconds)
+        self._shaken = AFTERWARDS if is_off else max(self._shaken - 1, 0)
+        if self._gone:
             self._unsteady2 += LEARNING * ((twist - self.twist) ** 2 - self._unsteady2)
-        self._has_gone = True
+        self._gone, self._was_fixed = self._gone + 1, is_fixed(match)
         self.since = grown
-        share = self._usual_share or match.share
-        self._usual_share = share + LEARNING * (match.share - share)
+        self._misfit.learn(self._misfit_of(match))
+        self._count.learn(match.num_inliers)
+        self._share.learn(match.share)
+        self._square.learn(match.error**2)
         self.T_odom_middle, self.twist = match.T_map_body, twist
         if seconds > 0.0:
-            self._V, usual = step / seconds**2, self._usual_s or seconds
-            self._usual_s = usual + LEARNING * (seconds - usual)
+            usual = self._usual_s or seconds
+            self._V, self._usual_s = step / seconds**2, usual + LEARNING * (seconds - usual)
         self._middle_ns = max(middle_ns, self._middle_ns + round(seconds * 1e9))
         # By how much a motion that is not constant errs, ½ a (Δt/2)², here and at the keyframe.
         shaken = 2.0 * np.diag(self._unsteady2) * (seconds / 8.0) ** 2
@@ -180,6 +249,18 @@ class CloudMotion:
             change += np.array([config.unseen, config.unseen_rad])
         V = self._V + np.diag(np.repeat(change, 3) ** 2)
         return np.asarray(V * seconds**2 + FINEST**2 * np.eye(6))
+
+
+def _sizes(tangent: Array) -> Array:
+    """Return how far a tangent (6,) moves, and turns."""
+    return np.array([np.linalg.norm(tangent[:3]), np.linalg.norm(tangent[3:])])
+
+
+def is_fixed(match: SweepMatch) -> bool:
+    """Say whether a match says where it is, whatever the rotation."""
+    H = match.information
+    of_place = H[:3, :3] - H[:3, 3:] @ np.linalg.pinv(H[3:, 3:]) @ H[3:, :3]
+    return bool(np.linalg.eigvalsh(of_place)[0] > FIXED**-2)
 
 
 def _together(loose: Array, information: Array) -> Array:

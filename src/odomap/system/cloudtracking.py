@@ -32,13 +32,14 @@ from odomap.errors import CalibrationError
 from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
 from odomap.geometry.so3 import orthonormalize
-from odomap.lidar.frontend import FrontEnd, SweepMatch
+from odomap.lidar.frontend import FrontEnd
 from odomap.maps.edges import LOOP, ODOMETRY
 from odomap.maps.estimate import Estimate, Status
 from odomap.maps.keyframes import Keyframe
 from odomap.maps.map import Map
 from odomap.sensors.frame import Frame
 from odomap.system.cloudconfig import CloudTrackingConfig
+from odomap.system.cloudlaying import CloudLayer, Laid
 from odomap.system.cloudmotion import CloudMotion
 from odomap.system.cloudrecognition import CloudFinder, FoundCloud
 from odomap.system.cloudsurroundings import Surroundings
@@ -96,6 +97,7 @@ class CloudTracker:
         self._around = Surroundings(map, viewer.T_body_lidar, config)
         self.path = Path(map)
         self._motion = CloudMotion(config)
+        self._layer = CloudLayer(front_end, self._motion, config)
         self._T_odom_body = np.eye(4)
         self._keyframe, self._T_odom_keyframe = -1, np.eye(4)
         self._tie = ODOMETRY
@@ -133,14 +135,13 @@ class CloudTracker:
         self._is_astray = self._is_astray or self._motion.is_anywhere(seconds)
         if self._is_astray:
             return self._lose(view, ASTRAY)
-        match, twist = self._match(view, seconds)
-        is_second = self._first is not None and not self._is_wrong(match, seconds)
-        if self._first is not None and is_second:
-            match, twist = self._begin_again(self._first, view, seconds, twist)
+        laid, is_second = self._layer.lay(view, seconds), False
+        if self._first is not None and not laid.wrong:
+            laid, is_second = self._begin_again(self._first, view, seconds, laid), True
         view.clock.lap("track")
-        if wrong := self._is_wrong(match, seconds):
-            return self._lose(view, wrong)
-        return self._go_on(view, match, twist, seconds, is_second)
+        if laid.wrong:
+            return self._lose(view, laid.wrong)
+        return self._go_on(view, laid, seconds, is_second)
 
     def make_keyframe(self) -> Keyframe | None:
         """Make the last sweep a keyframe if it is to be one, and return it; else None."""
@@ -174,16 +175,17 @@ class CloudTracker:
         if before is None or not 0.0 < seconds < GLIMPSE_S:
             return UNKNOWN
         self._start(before)
-        match, twist = self._match(view, seconds)
-        if self._is_wrong(match, seconds):
+        laid = self._layer.lay(view, seconds)
+        if laid.wrong:
             return UNKNOWN
-        match, twist = self._begin_again(before, view, seconds, twist)
-        self._motion.know(twist, match.information * seconds**2)
+        laid = self._begin_again(before, view, seconds, laid)
+        self._motion.know(laid.twist, laid.match.information * seconds**2)
         return self._motion.known
 
     def _start(self, view: CloudView) -> None:
         """Begin the front-end's map with a sweep."""
         self._front_end.clear()
+        self._layer.clear()
         self._T_odom_body, self._first, self._tie = np.eye(4), view, ODOMETRY
         self._motion.begin(np.eye(4), _middle_ns(view))
         self._front_end.insert(view.prepared, np.eye(4), np.zeros(6))
@@ -193,49 +195,24 @@ class CloudTracker:
         self._start(view)
         self._lost, self._unplaced, self._is_astray, self._glimpsed = 0, 0, False, None
 
-    def _begin_again(
-        self, first: CloudView, view: CloudView, seconds: float, twist: Array
-    ) -> tuple[SweepMatch, Array]:
+    def _begin_again(self, first: CloudView, view: CloudView, seconds: float, laid: Laid) -> Laid:
         """Begin the map again with the first sweep deskewed, as its motion is known by now."""
         self._first = None
         for _ in range(AGAIN):
             self._front_end.clear()
-            motion = self._motion
+            motion, twist = self._motion, laid.twist
             motion.T_odom_middle, motion.twist = se3_exp(first.middle * twist), twist
             self._front_end.insert(first.prepared, motion.T_odom_middle, twist)
-            match, twist = self._match(view, seconds)
-        self._T_odom_keyframe = self._motion.T_odom_middle @ se3_exp(-first.middle * twist)
-        return match, twist
+            laid = self._layer.lay(view, seconds)
+        self._T_odom_keyframe = self._motion.T_odom_middle @ se3_exp(-first.middle * laid.twist)
+        return laid
 
-    def _match(self, view: CloudView, seconds: float) -> tuple[SweepMatch, Array]:
-        """Lay a sweep down where it should be, and again with the motion that this gives."""
-        twist, T = self._motion.twist, self._motion.predicted(seconds)
-        for _ in range(self._config.rounds):
-            match = self._front_end.match(view.prepared, T, twist)
-            T = match.T_map_body
-            twist = self._motion.twist_to(T, seconds)
-        return match, twist
-
-    def _is_wrong(self, match: SweepMatch, seconds: float) -> str:
-        """Say why a match cannot be; empty if it can."""
-        config = self._config
-        if match.share < config.min_share:
-            return (
-                f"only {match.share:.0%} of {match.num_points} points lie on what is known, "
-                f"{config.min_share:.0%} needed"
-            )
-        moved = se3_log(se3_inverse(self._motion.T_odom_middle) @ match.T_map_body)
-        fast = np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])
-        if fast[0] > config.fastest * max(seconds, 0.1):
-            return f"it would have moved by {fast[0]:.1f} m in {seconds:.2g} s"
-        return self._motion.doubt(match, seconds)
-
-    def _go_on(
-        self, view: CloudView, match: SweepMatch, twist: Array, seconds: float, is_second: bool
-    ) -> Estimate:
+    def _go_on(self, view: CloudView, laid: Laid, seconds: float, is_second: bool) -> Estimate:
         """Take a match as found; the second sweep becomes a keyframe, as the first has no cloud."""
+        match, twist = laid.match, laid.twist
         told = self._lost > 0, not self._is_mapping
         covariance = self._motion.go(match, twist, seconds, _middle_ns(view), *told)
+        self._layer.note(view)
         T_odom_middle = self._motion.T_odom_middle
         self._T_odom_body = T_odom_middle @ se3_exp(-view.middle * twist)
         if self._is_mapping:
