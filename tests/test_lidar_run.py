@@ -83,3 +83,48 @@ def test_the_cloud_is_exported_by_the_ending_of_its_name(done, tmp_path, capsys)
     assert "a.xyz: give a name that ends in .ply or .pcd" in capsys.readouterr().err
     assert main(["export", str(done), "--mesh", str(tmp_path / "m.ply")]) == 2
     assert "give --cloud FILE" in capsys.readouterr().err
+
+
+def test_what_is_for_cameras_is_refused_in_one_line(done, tmp_path, capsys):
+    for command, says in (
+        (["export", str(done), "--colmap", str(tmp_path / "c")], "a laser's map has no images"),
+        (["merge", str(done), str(other_map(done, tmp_path)), "--out", str(tmp_path / "m.odomap")],
+         "maps of cameras alone can be merged"),
+        (["run", WORLD.format(3), "--odometry-only", "--out", str(tmp_path / "o")],
+         "--cloud-closing.enabled false looks for no loops"),
+    ):  # fmt: skip
+        assert main(command) == 2
+        err = capsys.readouterr().err.strip().splitlines()
+        assert says in err[-1]
+
+
+def other_map(done, tmp_path):
+    file = tmp_path / "other.odomap"
+    file.write_bytes((done / "map.odomap").read_bytes())
+    return file
+
+
+def test_info_of_a_run_is_that_of_its_map(done, capsys):
+    assert main(["info", str(done)]) == 0
+    of_run = capsys.readouterr().out
+    assert main(["info", str(done / "map.odomap")]) == 0
+    assert of_run == capsys.readouterr().out
+    assert "made with      lidar" in of_run
+    assert of_run.count("sensors") == 1
+    assert "landmarks" not in of_run
+    assert not [line for line in of_run.splitlines() if not line.split(maxsplit=1)[1:]]
+
+
+def test_directions_that_nothing_fixes_are_warned_of(tmp_path, capsys):
+    world = "sim:tunnel?sensors=lidar3d&beams=16&columns=360&frames=25&seed=2"
+    assert main(["run", world, "--out", str(tmp_path / "t"), "--quiet"]) == 0
+    err = capsys.readouterr().err
+    assert "tracked with a doubt, first frame" in err
+    assert "do not fix translation" in err
+
+
+def test_clouds_of_both_kinds_are_registered(done, tmp_path, capsys):
+    for name in ("a.pcd", "b.ply"):
+        assert main(["export", str(done), "--cloud", str(tmp_path / name), "--no-picture"]) == 0
+    assert main(["register", str(tmp_path / "a.pcd"), str(tmp_path / "b.ply")]) == 0
+    assert "converged" in capsys.readouterr().out

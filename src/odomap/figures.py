@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["figures"]
 
+DOUBTED = 0.1
+"""Share of frames that may be tracked with a doubt before a person is told."""
+
 
 def figures(
     source: "Source", logbook: Logbook, result: "Result", is_mapping: bool = True
@@ -83,9 +86,19 @@ def figures(
         warnings.append(f"a gap of {seconds:.2f} s after frame {frame_id}")
     if lost and not metrics["failure"]:
         warnings.append(f"{len(lost)} of {metrics['frames']} frames lost: {lost[0].reason}")
+    warnings += _doubts(logbook)
     metrics["warnings"] = warnings
     metrics["versions"] = versions()
     return metrics, warnings
+
+
+def _doubts(logbook: Logbook) -> list[str]:
+    """Say of how many frames a pose is not all that was asked for, if they are not few."""
+    doubted = [e for e in logbook.estimates if e.status == Status.TRACKING and e.reason]
+    if len(doubted) <= DOUBTED * len(logbook.estimates):
+        return []
+    share, first = f"{len(doubted)} of {len(logbook.estimates)} frames", doubted[0]
+    return [f"{share} tracked with a doubt, first frame {first.frame_id}: {first.reason}"]
 
 
 def _unplaced(logbook: Logbook) -> str:

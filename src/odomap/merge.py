@@ -179,6 +179,11 @@ def _common_rig(a: SavedMap, b: SavedMap, given: "Rig | None") -> "tuple[Rig, st
             raise InputError(
                 f"{saved.name}: does not say which cameras it was made with: give them as a rig"
             )
+        if saved.sensors in ("lidar", "lidar2d"):
+            raise InputError(
+                f"{saved.name}: was made with {KINDS[saved.sensors]}: maps of cameras alone can be "
+                "merged; 'odomap continue' goes on with a map in another recording"
+            )
     there, here = (saved.rig or given for saved in (a, b))
     assert there is not None
     assert here is not None

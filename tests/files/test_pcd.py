@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from odomap.errors import InputError
+from odomap.files.cloudfiles import read_cloud, write_cloud
 from odomap.files.pcd import read_pcd, write_pcd
 from sweepworlds import lzf, pcd_bytes
 
@@ -157,3 +158,14 @@ def test_text_that_is_none(tmp_path: Path) -> None:
         read_pcd(file)
     with pytest.raises(InputError, match="cannot be read: No such file"):
         read_pcd(tmp_path / "b.pcd")
+
+
+def test_a_cloud_is_read_by_its_name(tmp_path):
+    points = np.array([[1.0, 2, 3], [np.nan, 0, 0], [4, 5, 6]], np.float32)
+    write_pcd(tmp_path / "a.pcd", dict(zip("xyz", points.T, strict=True)))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd").points, points[[0, 2]])
+    write_cloud(tmp_path / "a.ply", dict(zip("xyz", points.T, strict=True)))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points, points)
+    write_pcd(tmp_path / "b.pcd", {"x": points[:, 0], "y": points[:, 1]})
+    with pytest.raises(InputError, match=r"b\.pcd: has no fields x, y and z"):
+        read_cloud(tmp_path / "b.pcd")

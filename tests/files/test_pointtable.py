@@ -136,3 +136,9 @@ def test_ply_with_all_its_columns(tmp_path: Path, text: bool) -> None:
     (tmp_path / "a.ply").write_bytes(head.replace(" z", " q").encode() + body)
     with pytest.raises(InputError, match="no vertices with x, y and z"):
         read_ply_points(tmp_path / "a.ply")
+
+
+def test_rows_are_points_and_not_columns(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 500)))
+    with pytest.raises(InputError, match=r"a\.npy: is of shape \(3, 500\): .*transpose it"):
+        read_npy(tmp_path / "a.npy")

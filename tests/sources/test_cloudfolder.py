@@ -280,3 +280,19 @@ def test_real_columns_are_needed(tmp_path: Path) -> None:
     root = write(tmp_path, drop=("z",))
     with pytest.raises(InputError, match="points have no 'z', but x, y, intensity"):
         odomap.open(root)
+
+
+def test_numbers_of_beams_that_say_none(tmp_path: Path) -> None:
+    def ring(found: Columns) -> NDArray[np.generic]:
+        known = found["ring"].copy()
+        known[::50] = 65535
+        return known
+
+    source = odomap.open(write(tmp_path, ring=ring))
+    assert source.rig.lidars[0].beams == 16
+    sweep, there = source.frame(1).cloud, columns(1)["ring"]
+    assert sweep is not None
+    assert sweep.beams is not None
+    assert (sweep.beams[::50] == -1).all()
+    kept = np.arange(len(there)) % 50 > 0
+    np.testing.assert_array_equal(sweep.beams[kept], there[kept])

@@ -71,7 +71,7 @@ def test_unrecognised_folder_says_what_it_holds(tmp_path: Path) -> None:
 
 
 def test_unrecognised_file(tmp_path: Path) -> None:
-    (tmp_path / "a.xyz").write_text("")
+    (tmp_path / "a.xyz").write_text("1 2 3")
     with pytest.raises(InputError, match="files of this kind cannot be opened; supported are"):
         open_source(tmp_path / "a.xyz")
 
@@ -120,3 +120,9 @@ def test_rig_of_the_user(kitti: Make, tmp_path: Path) -> None:
     (sequence / "rig.yaml").unlink()
     with pytest.raises(CalibrationError, match="or give --rig"):
         open_source(sequence)
+
+
+def test_an_empty_file_is_said_to_be_empty(tmp_path: Path) -> None:
+    (tmp_path / "a.pcap").write_bytes(b"")
+    with pytest.raises(InputError, match=r"a\.pcap: is empty"):
+        open_source(tmp_path / "a.pcap")

@@ -230,3 +230,29 @@ def test_nothing_there(tmp_path: Path) -> None:
     write_velodyne(tmp_path)
     with pytest.raises(InputError, match="no option 'tims'"):
         odomap.open(f"{tmp_path}?tims=off")
+
+
+def test_bytes_that_were_damaged_are_no_points(tmp_path: Path, recwarn) -> None:
+    root = write_velodyne(tmp_path)
+    file = root / "velodyne" / "000002.bin"
+    rows = np.frombuffer(file.read_bytes(), "<f4").reshape(-1, 4).copy()
+    noise = np.random.default_rng(0).integers(0, 256, (4000, 16), np.uint8).view("<f4")
+    rows[:4000] = noise
+    rows[5000, :3] = 3e6
+    file.write_bytes(rows.tobytes())
+    source = odomap.open(root)
+    assert source.rig.lidars[0].range_m[1] < 300.0  # garbage goes to 1e38
+    sweep = source.frame(2).cloud
+    assert sweep is not None
+    seen = sweep.points[np.isfinite(sweep.points).all(axis=1)]
+    assert len(rows) - 4000 <= len(seen) < len(rows)
+    assert np.abs(seen).max() < 1e7
+    assert not [w for w in recwarn if "invalid value" in str(w.message)]
+
+
+def test_of_sweeps_without_points_nothing_is_claimed(tmp_path: Path) -> None:
+    for k in range(3):
+        (tmp_path / f"{k:06d}.bin").write_bytes(b"")
+    source = odomap.open(tmp_path)
+    assert "the sweeps that were looked at hold no points" in source.notes
+    assert source.rig.lidars[0].sweep == "none"

@@ -190,6 +190,10 @@ class Export:
 
         if self.rig is not None:
             saved = replace(saved, rig=read_rig(self.rig))
+        if saved.sensors in ("lidar", "lidar2d"):
+            raise InputError(
+                f"{saved.name}: --colmap: a laser's map has no images: give --cloud FILE"
+            )
         eye = saved.eye()
         model = write_colmap(make_folder(folder), saved.map, eye.camera, eye.T_body_camera)
         counts = f"{len(model.keyframes)} images, {len(model.point_ids)} points"

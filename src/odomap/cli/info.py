@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Info"]
 
+MAP = "map.odomap"
 VARIES = 1.5
 """A rate varies if the longest step between frames is so many shortest ones."""
 
@@ -25,7 +26,7 @@ class Info:
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """A recording (EuRoC, KITTI, TUM RGB-D, a video, a folder of images or of a LiDAR's clouds, a
     laser's log, a bag, a capture), a camera ('camera:0'), a world.yaml,
-    'sim:room?seed=3&frames=100', or a map file (map.odomap)."""
+    'sim:room?seed=3&frames=100', or a map: the output folder of a run, or its map.odomap."""
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A rig.yaml: which sensors there are and where they are mounted."""
     check: bool = False
@@ -35,10 +36,13 @@ class Info:
 
     def execute(self) -> int:
         """Print the facts."""
-        if Path(self.data).suffix == ".odomap":
+        place = Path(self.data)
+        if place.is_dir() and (place / MAP).is_file() and (place / "metrics.json").is_file():
+            place /= MAP  # of a run
+        if place.suffix == ".odomap":
             from odomap.files.mapdescribe import describe_map, map_lines
 
-            inside = describe_map(self.data, check=self.check)
+            inside = describe_map(place, check=self.check)
             print(json.dumps(inside, indent=2) if self.json else "\n".join(map_lines(inside)))
             return 0
         from odomap.sources.describe import describe

@@ -15,7 +15,7 @@ __all__ = ["Register", "rows"]
 
 @dataclass(frozen=True)
 class Register:
-    """Find how one cloud lies in another (PLY files).
+    """Find how one cloud lies in another (PLY or PCD files).
 
     Prints T_target_source, how many points met, and what the clouds do not fix; --out writes the
     source as it lies in the target. Exit code 1 if it did not converge.
@@ -43,11 +43,12 @@ class Register:
 
     def execute(self) -> int:
         """Register, write, and say what was found."""
-        from odomap.files.clouds import read_ply, write_ply
+        from odomap.files.cloudfiles import read_cloud
+        from odomap.files.clouds import write_ply
         from odomap.lidar.registration import register
         from odomap.maps.surface import Surface
 
-        source, target = read_ply(self.source), read_ply(self.target)
+        source, target = read_cloud(self.source), read_cloud(self.target)
         found = register(
             source,
             target,

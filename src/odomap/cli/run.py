@@ -176,14 +176,16 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
     if m["frames"]:
         rate = f"{m['real_time_factor']:.2f} x real time" if m["real_time_factor"] else ""
         lines.append(("ms per frame", f"{ms['median']:.1f} median, {ms['p95']:.1f} p95  {rate}"))
-        lines.append(("map", f"{m['keyframes']} keyframes, {m['landmarks']} landmarks"))
+        landmarks = f", {m['landmarks']} landmarks" if m["landmarks"] else ""
+        lines.append(("map", f"{m['keyframes']} keyframes{landmarks}"))
         if m["loops_closed"] or m["loops_rejected"]:
             lines.append(("loops", loops_text(m["loops_closed"], m["loops_rejected"])))
         unit = "m" if m["is_metric"] else "units (no scale)"
         lines.append(("path", f"{m['path_m']:.3f} {unit} in {m['duration_s']:.2f} s"))
     if m.get("ate_rmse_m") is not None:
         path = m["path_m"] * m["ate"]["scale"]
-        share = f" ({100 * m['ate_rmse_m'] / path:.2f} % of the path)" if path else ""
+        percent = 100 * m["ate_rmse_m"] / path if path else 0.0
+        share = f" ({percent:.{2 if percent >= 0.1 else 4}f} % of the path)" if path else ""
         fitted = "" if m["is_metric"] else ", scale fitted"
         lines.append(("ATE RMSE", f"{m['ate_rmse_m']:.4f} m{share}{fitted}"))
     lines.append(("peak memory", f"{m['peak_memory_mb']:.0f} MB"))

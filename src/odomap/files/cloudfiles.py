@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from odomap.errors import InputError
 from odomap.files.atomic import atomic_binary
-from odomap.files.pcd import write_pcd
+from odomap.files.clouds import read_ply
+from odomap.files.pcd import read_pcd, write_pcd
+from odomap.maps.surface import Surface
 
-__all__ = ["ENDINGS", "check_ending", "write_cloud"]
+__all__ = ["ENDINGS", "check_ending", "read_cloud", "write_cloud"]
 
 ENDINGS = (".ply", ".pcd")
 
@@ -27,6 +29,24 @@ def check_ending(path: str | Path) -> None:
     """Raise an InputError unless a file can be written by its name."""
     if Path(path).suffix.lower() not in ENDINGS:
         raise InputError(f"{path}: give a name that ends in {' or '.join(ENDINGS)}")
+
+
+def read_cloud(path: str | Path) -> Surface:
+    """Read the places of a cloud, and of a PLY what else a surface has.
+
+    Args:
+        path: a PCD by its name, else a PLY.
+
+    Raises:
+        InputError: neither, without x, y and z, or a file that ends too early.
+    """
+    if Path(path).suffix.lower() != ".pcd":
+        return read_ply(path)
+    columns = read_pcd(path).columns
+    if any(name not in columns for name in "xyz"):
+        raise InputError(f"{path}: has no fields x, y and z")
+    points = np.stack([columns[name].astype(np.float32) for name in "xyz"], axis=1)
+    return Surface(points[np.isfinite(points).all(axis=1)])
 
 
 def write_cloud(path: str | Path, columns: Mapping[str, NDArray[np.float32]]) -> None:

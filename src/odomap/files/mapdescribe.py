@@ -8,6 +8,7 @@ IEEE Transactions on Robotics 32(6), 2016.
 """
 
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -73,14 +74,19 @@ def _sensors(rig: Rig | None) -> list[str] | None:
     return sensors + [f"lidar {m.name}" for m in rig.lidars]
 
 
+SETTINGS = MappingProxyType({"sensors": "made with"})
+"""Settings of a map by other names, where theirs is that of another line."""
+
+
 def map_lines(facts: dict[str, Any]) -> list[str]:
     """Return the facts as lines for people."""
     edges = ", ".join(f"{n} {kind}" for kind, n in facts["edges_of_kind"].items())
     payloads = ", ".join(f"{kind} of {n}" for kind, n in facts["payloads"].items())
+    of_eyes = facts["landmarks"] > 0 or "cloud" not in facts["payloads"]
     rows = [
         ("keyframes", f"{facts['keyframes']}, and {facts['stubs']} culled ones"),
         ("payloads", payloads or "none"),
-        ("landmarks", f"{facts['landmarks']}, seen {facts['observations']} times"),
+        *([("landmarks", f"{facts['landmarks']}, seen {facts['observations']} times")] * of_eyes),
         ("edges", f"{facts['edges']}" + (f" ({edges})" if edges else "")),
     ]
     if facts["first_stamp_ns"] is not None:
@@ -89,7 +95,8 @@ def map_lines(facts: dict[str, Any]) -> list[str]:
     rows.append(("path", f"{facts['path_units']:.2f} along the keyframes"))
     rig = "not said" if facts["rig"] is None else "; ".join(facts["rig"])
     rows.append(("sensors", rig))
-    rows += [(name[:14], str(value)) for name, value in facts["settings"].items()]
+    said = {SETTINGS.get(name, name): str(value) for name, value in facts["settings"].items()}
+    rows += [(name[:14], value) for name, value in said.items() if value]
     whole = "all of it was read and fits" if facts["checked"] else "--check reads all of it"
     rows.append(("file", f"{facts['bytes'] / 2**20:.2f} MB, by odomap {facts['odomap']}; {whole}"))
     head = f"{Path(facts['file']).name} (odomap map, version {facts['version']})"

@@ -26,7 +26,7 @@ __all__ = ["PointTable", "file_bytes", "read_las", "read_npy"]
 
 LAS_HEADER = 227
 """Bytes of the shortest header of a LAS file."""
-MOST_BEAMS = 256
+MOST_BEAMS, MOST_COLUMNS = 256, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +94,10 @@ def read_npy(path: str | Path) -> PointTable:
     if array.ndim != 2 or array.shape[1] < 3 or kind.kind not in "fiu":
         raise InputError(
             f"{file}: is {kind} of shape {shape}: rows x y z [intensity ...] are needed"
+        )
+    if array.shape[1] > MOST_COLUMNS:
+        raise InputError(
+            f"{file}: is of shape {shape}: a row is a point, x y z [intensity ...]; transpose it"
         )
     columns = {name: array[:, k] for k, name in zip(range(4), ("x", "y", "z", "intensity"))
                if k < array.shape[1]}  # fmt: skip

@@ -39,7 +39,10 @@ def deskew(points: Array, times: Array, twist: Array) -> Array:
 
 @kernel
 def deskew_into(points: Array, times: Array, twist: Array, out: Array) -> None:
-    """out = exp(ξ t) p = p + t (a V ρ) + (sin θ) k × p + (1 - cos θ) k × (k × p), θ = |ω| t."""
+    """out = exp(ξ t) p = p + t V(θ) ρ + sin θ k × p + (1 - cos θ) k × (k × p).
+
+    ξ = (ρ, ω), θ = |ω| t, k = ω / |ω|.
+    """
     w = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
     kx, ky, kz = 0.0, 0.0, 0.0
     if w > 0.0:

@@ -153,6 +153,8 @@ def _recognised(root: Path, rig: Rig | str | Path | None, options: dict[str, str
             return _simulated(str(root), rig)
         if is_video(root):
             return VideoSource(root, None if rig is None else load_rig(rig))
+        if not root.stat().st_size:
+            raise InputError(f"{root}: is empty: copy it again")
         raise InputError(f"{root}: files of this kind cannot be opened; supported are {SUPPORTED}")
     if (root / "world.yaml").exists():
         return _simulated(str(root / "world.yaml"), rig)

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 FEWEST, MOST = 4, 160
 """Beams that are told by rows of a cloud, and by numbers."""
+MOST_STRANGE = 0.1
+"""Share of the points whose number may be none: some drivers write 255 or 65535."""
 CROSSING = 0.5
 """Lines are not above each other if the spread of one is so much of the distance between two."""
 ROWS, COLUMNS = "the rows of the cloud", "the columns of the cloud"
@@ -122,8 +124,8 @@ def _ranks(
     """Return the beam of each number of a column; None if these are no beams above each other."""
     number = np.concatenate([n.astype(np.float64) for n in numbers])
     points = np.concatenate(clouds)
-    known = np.isfinite(number) & (number >= 0)
-    if not known.any() or number[known].max() >= MOST or (number[known] % 1).any():
+    known = np.isfinite(number) & (number >= 0) & (number < MOST)
+    if not known.any() or known.mean() < 1.0 - MOST_STRANGE or (number[known] % 1).any():
         return None
     which, points = number[known].astype(np.int64), points[known]
     count = int(which.max()) + 1

@@ -25,6 +25,8 @@ Read = TypeVar("Read")
 SAMPLES, FEW_SAMPLES = 8, 2
 NEAR_M, FAR_M = 0.5, 120.0
 """Range of a LiDAR of which nothing is said: nearer is its carrier."""
+STRAY = 3.0
+"""What is so many times as far as all but a hundredth of a usual sweep was never measured."""
 MOST_WRONG = 0.75
 """A rig with so few of the beams, or so many more, is that of another sensor."""
 
@@ -37,6 +39,7 @@ class SweepSurvey:
         rows: fewest, usual and most rows of a sweep.
         share_lost: share of rows that are NaN or zero.
         range_m: nearest and farthest point.
+        reach_m: how far the sensor sees: to the farthest point, unless that is a stray one.
         elevation: lowest and highest point, radians; all but a thousandth of the points.
         view: how much of a turn is seen, radians.
         times: how it is known when each point was measured; empty if it is not.
@@ -49,6 +52,7 @@ class SweepSurvey:
     rows: tuple[int, int, int] = (0, 0, 0)
     share_lost: float = 0.0
     range_m: tuple[float, float] = (0.0, 0.0)
+    reach_m: float = 0.0
     elevation: tuple[float, float] = (0.0, 0.0)
     view: float = 0.0
     times: str = ""
@@ -101,12 +105,16 @@ def survey(sweeps: Sequence[Sweep], times: str = "", beams: int = 0, how: str = 
     )
     if not seen.any():
         return facts
+    ends = np.cumsum(rows)[:-1]
+    each = zip(np.split(distance, ends), np.split(seen, ends), strict=True)
+    reach = _reach([far[is_seen] for far, is_seen in each])
     points, distance = points[seen], distance[seen]
     elevation = np.arcsin(np.clip(points[:, 2] / distance, -1, 1))
     low, high = np.quantile(elevation, [0.0005, 0.9995]).tolist()
     return replace(
         facts,
         range_m=(float(distance.min()), float(distance.max())),
+        reach_m=reach,
         elevation=(low, high),
         view=_view(np.arctan2(points[:, 1], points[:, 0])),
     )
@@ -123,6 +131,13 @@ def survey_frames(source: RandomAccess) -> SweepSurvey:
     return survey(
         sweeps, "in the sweeps" if has_times else "", beams, "in the sweeps" * (beams > 0)
     )
+
+
+def _reach(distances: Sequence[NDArray[np.float64]]) -> float:
+    """Return the farthest of the distances (N,) of each sweep, but for stray ones."""
+    usual = np.median([np.quantile(some, 0.99) for some in distances if len(some)])
+    every = np.concatenate(distances)
+    return float(every[every <= STRAY * usual].max())
 
 
 def _span(columns: Sequence[NDArray[np.floating]]) -> tuple[float, float] | None:
@@ -155,7 +170,7 @@ def mounted_sweeps(mount: LidarMount, rig: Rig | None, facts: SweepSurvey, where
     """
     if rig is None:
         near, far = mount.range_m
-        reach = (near, max(far, float(np.ceil(facts.range_m[1]))))
+        reach = (near, max(far, float(np.ceil(facts.reach_m))))
         return Rig(lidars=(replace(mount, range_m=reach, beams=facts.beams),))
     if len(rig.lidars) != 1:
         raise CalibrationError(

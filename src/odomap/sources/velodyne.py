@@ -40,6 +40,7 @@ from odomap.sources.filenames import Clock, in_order, stamp_names
 from odomap.sources.listing import list_rows
 from odomap.sources.options import check_options
 from odomap.sources.oxts import epoch_text, read_oxts
+from odomap.sources.pointfields import FARTHEST_M
 from odomap.sources.recording import check_truth
 from odomap.sources.source import Skipped, UnusableFrame
 from odomap.sources.survey import FAR_M, mounted_sweeps, sample, survey
@@ -143,7 +144,10 @@ class VelodyneSource(SweepLog):
                 "is it cut off? copy it again",
             )
         rows = np.frombuffer(data, "<f4").reshape(-1, COLUMNS)
-        return Sweep(rows[:, :3].astype(np.float64), intensities=rows[:, 3].astype(np.float32))
+        with np.errstate(invalid="ignore"):  # bytes that were damaged are any number
+            points, intensities = rows[:, :3].astype(np.float64), rows[:, 3].astype(np.float32)
+            points[~(np.abs(points) < FARTHEST_M).all(axis=1)] = np.nan
+        return Sweep(points, intensities=intensities)
 
     def _column(self, sweep: Sweep) -> Sweep:
         """Return a sweep with what follows from where its points are."""
@@ -174,7 +178,9 @@ def _judged(how: str, sweeps: list[Array], beams: int, said: str) -> tuple[bool,
         return how == "azimuth", f"?times={how} is believed"
     if said != "none":
         return True, f"sweeps turn {said}, as the rig says: times follow from the azimuth"
-    if sweeps and not BEAMS[0] <= beams <= BEAMS[1]:
+    if not sweeps:
+        return False, "the sweeps that were looked at hold no points"
+    if not BEAMS[0] <= beams <= BEAMS[1]:
         return False, (
             f"sweeps of {beams or 'unknown'} beams are not KITTI's: points carry no times; "
             "?times=azimuth, or 'sweep' in a rig.yaml, if they turn as KITTI's do"

@@ -123,8 +123,9 @@ def _decoder(capture: Capture, asked: str) -> tuple[Any, Any]:
     try:
         import velodyne_decoder
     except ImportError as error:
+        lacks = "" if error.name in ("velodyne_decoder", None) else f" ({error})"
         raise MissingExtra(
-            f"{capture.path}: a capture needs velodyne-decoder: pip install 'odomap[lidar]'"
+            f"{capture.path}: a capture needs velodyne-decoder{lacks}: pip install 'odomap[lidar]'"
         ) from error
     models = dict(velodyne_decoder.Model.__members__)
     if asked and asked not in models:

@@ -141,14 +141,24 @@ def _reason(
     if not found.converged:
         return found.reason
     if overlap < config.overlap:
-        return f"{overlap:.0%} of {found.num_points} points meet what is known there"
+        return (
+            f"{overlap:.0%} of {found.num_points} points meet what is known there, "
+            f"{config.overlap:.0%} needed"
+        )
     if found.error > config.misfit * config.voxel:
-        return f"its points are {found.error:.2f} m off the surface there, in the mean"
+        most = config.misfit * config.voxel
+        return (
+            f"its points are {found.error:.2f} m off the surface there, in the mean, "
+            f"{most:.2f} m allowed"
+        )
     agree, doubt = min(s.agree for s in seen), max(s.doubt for s in seen)
     if agree < config.agree:
-        return f"{agree:.0%} of what stands there was seen by both"
+        return f"{agree:.0%} of what stands there was seen by both, {config.agree:.0%} needed"
     if doubt > config.against:
-        return f"of what stands there {doubt:.0%} is where the other sweep looked through"
+        return (
+            f"of what stands there {doubt:.0%} is where the other sweep looked through, "
+            f"{config.against:.0%} allowed"
+        )
     return ""
 
 

@@ -272,9 +272,17 @@ def odometry_preset(rig: Rig) -> str:
     """Return the preset for odometry with what a rig carries: the same, with optical flow.
 
     Raises:
-        CalibrationError: it has no camera.
+        CalibrationError: it has no camera, and nothing else to start from.
+        ConfigError: it has a laser or a LiDAR alone.
     """
-    return f"{preset_for(rig)}-flow"
+    usual = preset_for(rig)
+    if f"{usual}-flow" not in PRESETS:
+        section = {"lidar": "cloud-closing", "lidar2d": "scan-closing"}[usual]
+        raise ConfigError(
+            "odometry alone is for cameras, and this rig has none: "
+            f"--{section}.enabled false looks for no loops"
+        )
+    return f"{usual}-flow"
 
 
 def make_association(config: Config, mask: NDArray[np.bool_]) -> "Association":
