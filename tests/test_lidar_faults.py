@@ -4,29 +4,20 @@ Faults of a recording are disturbances of a simulated street. What a pose claims
 truth: four standard deviations, and some centimetres.
 """
 
-import json
-import re
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from odomap.cli import main
 from odomap.errors import CalibrationError
-from odomap.files.clouds import read_ply_points
-from odomap.files.mapfile import load_map
-from odomap.files.trajectories import read_tum
 from odomap.geometry.lie import se3_inverse, se3_log, so3_exp
 from odomap.maps.atlas import Atlas
 from odomap.maps.edges import GAP
 from odomap.maps.estimate import Status
-from odomap.run import Interrupted, run
 from odomap.sources import disturb
 from odomap.sources.wrappers import Changed
 from odomap.system.slam import Slam
 from sweepruns import LEAST, PLACED, Kept, errors, judge, played
-from sweepworlds import pcd_bytes
 
 TILTED = so3_exp(np.array([0.3, -0.2, 0.7]))
 
@@ -238,65 +229,3 @@ def test_in_a_map_it_is_placed_at_once_and_outside_it_is_not(long_street):
         assert (np.abs(x) < LEAST + 4.0 * np.sqrt(np.diag(e.covariance))).all()
     assert all(e.status is Status.LOST for e in estimates[12:])
     assert result.map.num_keyframes == keyframes
-
-
-# ---- as a person meets them ----
-
-
-def columns_of(frame):
-    """Return a sweep as drivers write it, times in nanoseconds."""
-    sweep = frame.cloud
-    named = dict(zip("xyz", sweep.points.T.astype(np.float32), strict=True))
-    named |= {"intensity": sweep.intensities, "ring": sweep.beams.astype(np.uint16)}
-    return named | {"t": np.rint(1e9 * sweep.times).astype(np.uint32)}
-
-
-@pytest.fixture
-def folder(street, tmp_path):
-    """Return a folder of 30 PCD files, ten a second."""
-    root = tmp_path / "sweeps"
-    root.mkdir()
-    for k in range(30):
-        name = f"{1_700_000_000 + k // 10}.{k % 10}00000.pcd"
-        (root / name).write_bytes(pcd_bytes(columns_of(street.frame(k)), "binary"))
-    return root
-
-
-def test_files_that_are_cut_or_lie_cost_their_sweeps_and_nothing_else(folder, tmp_path):
-    files, out = sorted(folder.iterdir()), tmp_path / "out"
-    files[12].write_bytes(files[12].read_bytes()[:-1000])
-    lies = re.sub(rb"(POINTS|WIDTH) \d+", rb"\1 999999999", files[14].read_bytes())
-    files[14].write_bytes(lies)
-    assert main(["run", str(folder), "--out", str(out), "--quiet"]) == 0
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["frames"] == 28
-    assert metrics["lost"] == 0
-    told = json.dumps(metrics)
-    assert files[12].name in told
-    assert files[14].name in told
-    assert len(read_tum(out / "trajectory.tum")) == 28
-    assert load_map(out / "map.odomap").num_keyframes > 5
-
-
-def test_sweeps_in_another_unit_end_a_run_and_keep_what_there_is(street, tmp_path):
-    wrong = disturb.misscale_times(street, 1e3)
-    changed = Changed(street, "changed", lambda f: f if f.id < 20 else wrong.frame(f.id))
-    with pytest.raises(CalibrationError, match="are they in milliseconds, or nanoseconds") as told:
-        run(changed, tmp_path)
-    assert "\n" not in str(told.value)
-    assert len(read_tum(tmp_path / "trajectory.tum")) == 20
-    assert load_map(tmp_path / "map.odomap").num_keyframes > 3
-
-
-def test_ctrl_c_keeps_what_was_mapped(street, tmp_path):
-    def stop(frame):
-        if frame.id == 25:
-            signal.raise_signal(signal.SIGINT)
-        return frame
-
-    with pytest.raises(Interrupted) as stopped:
-        run(Changed(street, "stopped", stop), tmp_path)
-    assert stopped.value.result.metrics["interrupted"] is True
-    assert len(read_tum(tmp_path / "trajectory.tum")) == 26
-    assert load_map(tmp_path / "map.odomap").num_keyframes > 5
-    assert len(read_ply_points(tmp_path / "cloud.ply").columns["x"]) > 5000

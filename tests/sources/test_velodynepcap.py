@@ -1,7 +1,5 @@
 """Captures of a Velodyne LiDAR, whole, with lost packets, and broken."""
 
-import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,49 +10,7 @@ from odomap.errors import CalibrationError, InputError, MissingExtra
 from odomap.sensors.rig import LidarMount, Rig
 from odomap.sources.packets import HOUR_US, read_capture, turns_of
 from odomap.sources.source import RandomAccess
-
-START_S = 1_700_000_000
-PACKET_US = 1327
-"""From packet to packet: 24 firings of 55.296 µs."""
-ANGLES = np.radians([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-ROOM = 8.0
-
-
-def packets(turns: float = 4.0, clock_us: int = 5_000_000, first: float = 250.0) -> Iterator[bytes]:
-    """Yield packets of a VLP-16 at 10 Hz in the middle of a square room of 16 m."""
-    step = 3600.0 * PACKET_US * 1e-6 / 12  # degrees of a block
-    for number in range(round(turns * 1e5 / PACKET_US)):
-        blocks = b""
-        for block in range(12):
-            azimuth = (first + (12 * number + block) * step) % 360
-            ranges = []
-            for firing in range(2):
-                phi = np.radians(azimuth + firing * step / 2)
-                flat = ROOM / max(abs(np.cos(phi)), abs(np.sin(phi)))
-                ranges += [round(flat / np.cos(a) / 0.002) for a in ANGLES]
-            words = b"".join(struct.pack("<HB", r, 10 * (k % 16)) for k, r in enumerate(ranges))
-            blocks += b"\xff\xee" + struct.pack("<H", round(azimuth * 100) % 36000) + words
-        told = (clock_us + number * PACKET_US) % HOUR_US
-        yield blocks + struct.pack("<IBB", told, 0x37, 0x22)
-
-
-def frame_of(data: bytes, port: int = 2368, host: bytes = b"\xc0\xa8\x01\xc9") -> bytes:
-    """Return a packet as it goes over a network."""
-    udp = struct.pack(">HHHH", port, port, len(data) + 8, 0)
-    ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + 8 + len(data), 0, 0x4000, 17, 17, 0)
-    return bytes(12) + b"\x08\x00" + ip + host + b"\xff" * 4 + udp + data
-
-
-def capture(path: Path, sent: list[bytes], late_s: float = 0.002, order: str = "<") -> Path:
-    """Write frames, one each 1327 µs by the host's clock, which is late."""
-    magic = 0xA1B2C3D4
-    data = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 65535, 1)]
-    for k, frame in enumerate(sent):
-        now = START_S * 10**6 + k * PACKET_US + round(late_s * 1e6)
-        head = struct.pack(f"{order}4I", now // 10**6, now % 10**6, len(frame), len(frame))
-        data.append(head + frame)
-    path.write_bytes(b"".join(data))
-    return path
+from pcapworlds import ANGLES, PACKET_US, ROOM, START_S, capture, frame_of, packets
 
 
 @pytest.fixture
