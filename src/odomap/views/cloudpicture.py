@@ -40,6 +40,8 @@ FINEST = 0.1
 """Least size of a pixel, metres."""
 LONGEST = 1600
 """Longer side of the cloud, pixels."""
+SHORTEST = 800
+"""The same of a room: squares of the picture are drawn larger until there are so many."""
 
 
 def cloud_picture(cloud: "CloudMap") -> Image:
@@ -74,13 +76,15 @@ def _drawn(tall: Array, path: Array, low: Array, metre: float) -> Image:
     share = np.sqrt(np.clip(tall, 0.0, 1.0))[:, :, None]
     colours = (1.0 - share) * np.array(LOW) + share * np.array(HIGH)
     picture = np.where(tall[:, :, None] < 0.0, PAPER, colours).astype(np.uint8)
+    times = max(1, SHORTEST // max(tall.shape))
+    picture, metre = picture.repeat(times, axis=0).repeat(times, axis=1), metre / times
     frame = (MARGIN_PX, FOOT_PX, MARGIN_PX, MARGIN_PX)
     more = max(0, 160 - picture.shape[1])
     picture = np.pad(picture, ((0, 0), (0, more), (0, 0)), constant_values=PAPER)
     image = cv2.copyMakeBorder(picture, *frame, cv2.BORDER_CONSTANT, value=(PAPER,) * 3)
     drawn = np.ascontiguousarray(image, np.uint8)
     if len(path):
-        top = low[1] + tall.shape[0] * metre
+        top = low[1] + picture.shape[0] * metre
         pixels = (path[:, :2] - (low[0], top)) * (1.0 / metre, -1.0 / metre)
         draw_path(drawn, pixels + MARGIN_PX - 0.5)
     draw_scale(drawn, 1.0 / metre)
