@@ -1,5 +1,7 @@
 """Simulated runs of a 3D LiDAR, and what they claim held against the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odomap.geometry.lie import se3_inverse, se3_log
@@ -58,3 +60,15 @@ def played(frames, rig, **more):
     system = Slam(rig, preset("lidar"), **more)
     estimates = [system.track(frame) for frame in frames]
     return estimates, system, system.finish()
+
+
+def tracked(frames, rig, front_end, closing=True):
+    """Return estimates and the system."""
+    config = preset("lidar")
+    config = replace(
+        config,
+        cloud_tracking=replace(config.cloud_tracking, front_end=front_end),
+        cloud_closing=replace(config.cloud_closing, enabled=closing),
+    )
+    system = Slam(rig, config)
+    return [system.track(frame) for frame in frames], system
