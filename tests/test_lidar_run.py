@@ -66,7 +66,9 @@ def test_a_run_goes_on_where_the_map_ends(done, tmp_path):
     assert main(["continue", str(done), WORLD.format(90), "--out", str(out), "--quiet"]) == 0
     before, after = load_map(done / "map.odomap"), load_map(out / "map.odomap")
     assert after.num_keyframes > before.num_keyframes
-    assert json.loads((out / "metrics.json").read_text())["lost"] == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["lost"] == 0
+    assert metrics["map_keyframes"] == after.num_keyframes > metrics["keyframes"]
 
 
 def test_the_cloud_is_exported_by_the_ending_of_its_name(done, tmp_path, capsys):
@@ -128,3 +130,10 @@ def test_clouds_of_both_kinds_are_registered(done, tmp_path, capsys):
         assert main(["export", str(done), "--cloud", str(tmp_path / name), "--no-picture"]) == 0
     assert main(["register", str(tmp_path / "a.pcd"), str(tmp_path / "b.ply")]) == 0
     assert "converged" in capsys.readouterr().out
+
+
+def test_a_path_is_compared_with_the_truth_of_a_simulated_world(done, capsys):
+    assert main(["eval", str(done / "trajectory.tum"), WORLD.format(60), "--json"]) == 0
+    out = capsys.readouterr().out
+    run = json.loads((done / "metrics.json").read_text())
+    assert f"{run['ate_rmse_m']:.6g}"[:6] in out

@@ -49,6 +49,7 @@ def figures(
     metrics["is_metric"] = result.is_metric
     metrics["path_m"] = float(result.trajectory.path_length) if len(result.trajectory) else 0.0
     metrics["keyframes"] = len(result.keyframes)
+    metrics["map_keyframes"] = result.map.num_keyframes
     metrics["landmarks"] = result.map.num_landmarks
     metrics["loops"] = sum(kind == LOOP for kind in result.map.edges().kind)
     metrics["loops_closed"] = None if logbook.loops is None else logbook.loops.num_closed

@@ -148,9 +148,9 @@ def read_reference(path: Path) -> "Trajectory":
     from odomap.files.trajectories import read_trajectory
     from odomap.sources.open import open as open_source
 
-    if not path.is_dir():
+    if not path.is_dir() and not str(path).startswith("sim:"):
         return read_trajectory(path)
-    truth = open_source(path).truth
+    truth = open_source(str(path)).truth
     if truth is None:
         raise InputError(f"{path}: this recording has no ground truth")
     return truth

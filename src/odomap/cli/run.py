@@ -177,7 +177,9 @@ def rows(result: "RunResult") -> list[tuple[str, str]]:
         rate = f"{m['real_time_factor']:.2f} x real time" if m["real_time_factor"] else ""
         lines.append(("ms per frame", f"{ms['median']:.1f} median, {ms['p95']:.1f} p95  {rate}"))
         landmarks = f", {m['landmarks']} landmarks" if m["landmarks"] else ""
-        lines.append(("map", f"{m['keyframes']} keyframes{landmarks}"))
+        own, all_of_them = m["keyframes"], m["map_keyframes"]
+        new = f" ({own} of this run)" if own < all_of_them and m["is_mapping"] else ""
+        lines.append(("map", f"{all_of_them} keyframes{new}{landmarks}"))
         if m["loops_closed"] or m["loops_rejected"]:
             lines.append(("loops", loops_text(m["loops_closed"], m["loops_rejected"])))
         unit = "m" if m["is_metric"] else "units (no scale)"

@@ -148,8 +148,8 @@ def _reason(
     if found.error > config.misfit * config.voxel:
         most = config.misfit * config.voxel
         return (
-            f"its points are {found.error:.2f} m off the surface there, in the mean, "
-            f"{most:.2f} m allowed"
+            f"its points are {found.error:.3f} m off the surface there, in the mean, "
+            f"{most:.3f} m allowed"
         )
     agree, doubt = min(s.agree for s in seen), max(s.doubt for s in seen)
     if agree < config.agree:
