@@ -60,6 +60,12 @@ def test_sweeps(tmp_path: Path, info: Call) -> None:
     assert "gap            1.000 s after frame 2" in info(root)[1]
 
 
+def test_lines_of_a_solid_state_lidar_are_not_above_each_other(info: Call) -> None:
+    world = "sim:room?sensors=lidar3d&frames=2&beams=8&columns=60"
+    assert "beams          8, in the sweeps\n" in info(world)[1]
+    assert "8, in the sweeps; not above each" in info(f"{world}&pattern=solid_state")[1]
+
+
 def test_truncated_sweep(tmp_path: Path, info: Call) -> None:
     root = write_velodyne(tmp_path / "drive", frames=3)
     file = root / "velodyne" / "000001.bin"

@@ -128,9 +128,9 @@ def survey_frames(source: RandomAccess) -> SweepSurvey:
     beams = max(
         (int(s.beams.max()) + 1 for s in sweeps if s.beams is not None and len(s)), default=0
     )
-    return survey(
-        sweeps, "in the sweeps" if has_times else "", beams, "in the sweeps" * (beams > 0)
-    )
+    is_above = any(mount.beams for mount in source.rig.lidars)
+    how = "in the sweeps" + ("" if is_above else "; not above each other")
+    return survey(sweeps, "in the sweeps" if has_times else "", beams, how if beams else "")
 
 
 def _reach(distances: Sequence[NDArray[np.float64]]) -> float:
