@@ -11,8 +11,9 @@ in voxels and with a wide search (`planefrontend`), from several guesses:
     x,    x_before exp(ξ Δt) with ξ = 0 (it stands still),    with ξ reversed.
 
 The one with the least truncated square Σ min(r², 9 σ²) is where it is; another than the match must
-be clearly better, since along a tunnel all are as good. From there the front-end lays it onto its
-map once more, and if that slips off again, the look at the sweep before is believed.
+be clearly better, since along a tunnel all are as good, and better still if the map there knows of
+none that is. From there the front-end lays it onto its map once more, and if that slips off again,
+the look at the sweep before is believed.
 
 Where none fits as two sweeps of this place do, the body is somewhere else, and lost.
 
@@ -44,8 +45,8 @@ COARSELY = 2.5
 """Side of the cells of which one point each is looked at, in voxels."""
 OTHERWISE = 0.0, -1.0
 """Of the motion so far: what else a body may do."""
-CLEARLY = 0.97
-"""Share of the misfit that another guess may leave at most."""
+CLEARLY, SURELY = 0.97, 0.93
+"""Share of the misfit that another guess may leave at most; and if the map does not know of it."""
 NEAR = 0.3, 0.03
 """How far two places of a sweep may be apart that are one, metres and radians."""
 TRUNCATED = 9.0
@@ -134,19 +135,20 @@ class CloudLayer:
         for T, twist in guesses:
             front_end.expect_anything()
             found.append(self._lay(front_end, prepared, T, twist, seconds))
-        best = _best(there, found)
+        best, left = _best(there, found)
         if motion.is_poor(laid.match) and (wrong := self._fits_nowhere(found)):
             return laid, wrong
-        if best is None or _is_near(best.match, laid.match):
+        if left > CLEARLY or not is_fixed(best.match) or _is_near(best.match, laid.match):
             return laid, ""
         at = best.match.T_map_body, best.twist
         again = self._lay(self._front_end, view.prepared, *at, seconds)
-        if not is_fixed(again.match):  # the map, which knows more, says that any place is as good
+        if not is_fixed(again.match) and left > SURELY:  # the map says that any place is as good
             return laid, ""
-        if _is_near(again.match, best.match):
+        if is_fixed(again.match) and _is_near(again.match, best.match):
             return again, ""
         # How many points lie on its own map is what its matches are compared by.
-        held = replace(again.match, T_map_body=at[0], information=best.match.information)
+        held = replace(best.match, num_inliers=again.match.num_inliers)
+        held = replace(held, num_points=again.match.num_points, error=again.match.error)
         return Laid(held, best.twist), ""
 
     def _fits_nowhere(self, found: list[Laid]) -> str:
@@ -188,12 +190,11 @@ def _looking(before: _Seen, view: CloudView) -> tuple[PlaneFrontEnd, ThinSweep]:
     return front_end, front_end.prepare(view.points)
 
 
-def _best(there: SweepMatch, found: list[Laid]) -> Laid | None:
-    """Return the one that fits best, if clearly better than where it is, and there alone."""
+def _best(there: SweepMatch, found: list[Laid]) -> tuple[Laid, float]:
+    """Return the one that fits best, and its misfit as a share of that of where it is."""
     fine = min(match.error for match in (there, *(laid.match for laid in found))) ** 2
     best = min(found, key=lambda laid: _misfit(laid.match, fine))
-    is_clear = _misfit(best.match, fine) < CLEARLY * _misfit(there, fine)
-    return best if is_clear and is_fixed(best.match) else None
+    return best, _misfit(best.match, fine) / max(_misfit(there, fine), 1e-12)
 
 
 def _misfit(match: SweepMatch, fine: float) -> float:
