@@ -1,5 +1,7 @@
 """How unsure steps, and all of them together, are along what surfaces say nothing of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,26 @@ def test_much_less_on_the_map_is_another_place_unless_it_lies_where_it_should():
     assert "carried off?" in motion.doubt(restless, STEP)
     assert not motion.is_anywhere(0.9)
     assert motion.is_anywhere(1.1)
+
+
+@pytest.mark.parametrize("stays", [0.03, 0.1, 0.3])
+def test_errors_of_sweeps_add_up_by_what_stays_of_them_in_the_map(stays):
+    """m ← m + s w, x = m + (1 - s) w: the map's error, and a sweep's by itself."""
+    config = replace(CONFIG, unsteady=1e-3, unsteady_rad=1e-4)
+    squares, sigma, known = [], np.sqrt(np.diag(SURE)), np.linalg.inv(SURE)
+    for seed in range(60):
+        rng, motion = np.random.default_rng(seed), CloudMotion(config)
+        motion.begin(np.eye(4), 0)
+        m = sigma * rng.normal(size=6)  # of the first sweep, from which all is counted
+        for n in range(1, 40):
+            w = sigma * rng.normal(size=6)
+            m = m + stays * w  # a body that stands still, and is placed where it is not
+            error = m + (1.0 - stays) * w
+            match = replace(match_at(se3_exp(error), known), stays=stays * np.eye(6))
+            covariance = motion.go(match, np.zeros(6), STEP, 10**8 * n, False, False)
+            squares.append(error @ np.linalg.solve(covariance, error) / 6.0)
+        # How bodies can move says a little of where they are, which stays, too: 0.04 of an error.
+        grown = np.diag(motion.since) / np.diag(SURE)
+        assert np.allclose(grown[3:], 1.0 + 39 * stays**2, rtol=0.2)
+        assert np.allclose(grown[:3], 1.0 + 39 * (stays + 0.04) ** 2, rtol=0.2)
+    assert 0.7 < np.mean(squares) < 1.4

@@ -31,7 +31,7 @@ class PointsConfig:
     """How far the very first guesses may be off, metres."""
     learning: Fraction = 0.1
     """Weight of the last sweep in how far they are off."""
-    alike: Positive = 10.0
+    alike: Positive = 2.0
     """Points that are one witness, as they share the errors of the surfaces they lie on."""
     least_spread: Positive = 0.1
     """Least mean square of distances that is believed, in variances of the thickness."""

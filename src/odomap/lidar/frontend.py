@@ -37,6 +37,10 @@ class SweepMatch:
         error: root mean square distance of the inliers from what they lie on, metres.
         converged: whether the steps became small.
         reason: what is wrong; empty if nothing is.
+        stays: (6, 6) what of an error of the sweep the map keeps, as it is seen from then on; None
+            where nobody knows.
+        bends: (6, 6) how far the body is off per change of the twist from sweep to sweep; None
+            where nobody knows.
     """
 
     T_map_body: Array
@@ -46,6 +50,8 @@ class SweepMatch:
     error: float
     converged: bool
     reason: str = ""
+    stays: Array | None = None
+    bends: Array | None = None
 
     @property
     def share(self) -> float:

@@ -73,13 +73,14 @@ class PlaneFrontEnd:
             return SweepMatch(T_map_body, np.zeros((6, 6)), 0, len(points), 0.0, False, "no map")
         surfaces, config = self._map, self._config
         wide = 9.0 * (1.0 + self._off2 / surfaces.sigma**2)
-        found = match_planes(surfaces, points, T_map_body, wide)
+        bent = _bent(prepared.times[rows])
+        found = match_planes(surfaces, points, bent, T_map_body, wide)
         self._note(T_map_body, found.T_map_body, points)
         information = found.information / (config.alike * max(found.mean, config.least_spread))
         error = surfaces.sigma * float(np.sqrt(found.mean))
         return SweepMatch(
             found.T_map_body, information, found.on, len(points), error, found.is_still,
-            _reason(found, points),
+            _reason(found, points), found.stays, found.bends,
         )  # fmt: skip
 
     def lying(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> SweepMatch:
@@ -122,6 +123,16 @@ class PlaneFrontEnd:
         """Forget the map."""
         self._map = None
         self.expect_anything()
+
+
+def _bent(times: Array) -> Array:
+    """Return by how much (N,) of a change of the motion from sweep to sweep points are off.
+
+    Where a motion changes by Δξ from sweep to sweep of length Δt, that from the middle of the last
+    one to that of this is ½ Δξ behind, and over the sweep it changes on: ½ Δξ (t + t² / Δt).
+    """
+    lasts = float(np.ptp(times)) if len(times) else 0.0
+    return 0.5 * times * (1.0 + times / lasts) if lasts > 0.0 else np.zeros(len(times))
 
 
 def _reason(found: PlaneMatch, points: Array) -> str:

@@ -35,7 +35,17 @@ from odomap.lidar.voxels import (
     slot_of,
 )
 
-__all__ = ["COARSER", "FAR_AWAY", "NONE", "OLD", "SURFACE", "TILT", "PlaneMap", "plane_kernel"]
+__all__ = [
+    "COARSER",
+    "FAR_AWAY",
+    "NONE",
+    "OLD",
+    "SURFACE",
+    "TILT",
+    "WHEN",
+    "PlaneMap",
+    "plane_kernel",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -49,6 +59,8 @@ FAR_AWAY = FURTHEST // 2
 """Where along x large voxels are in the table, in voxels; small ones stay nearer."""
 TILT = 3
 """Column of a voxel's mean that says how far its normal may be tilted: δ², radians squared."""
+WHEN, SUMS = 10, 11
+"""Column of a voxel's sums that adds up the numbers of its points' sweeps; and how many it has."""
 FEWEST = 6
 """Points from which on they may lie in a plane."""
 MANY = 400.0
@@ -94,9 +106,9 @@ def plane_kernel(
 @kernel
 def _insert_kernel(
     points: Array, first: int, size: float, table: Index, keys: Index, sums: Array, flags: Flags,
-    count: int,
+    count: int, sweep: float,
 ) -> tuple[int, int]:  # fmt: skip
-    """Add points from `first` on to the sums of a small voxel and a large one each.
+    """Add points of a sweep from `first` on to the sums of a small voxel and a large one each.
 
     Returns where it stopped, for want of room if before the end, and how many voxels there are.
     """
@@ -113,11 +125,11 @@ def _insert_kernel(
             if v < 0:
                 v = count
                 table[slot, 0], table[slot, 1], keys[v] = key, v, key
-                for c in range(10):
+                for c in range(SUMS):
                     sums[v, c] = 0.0
                 count += 1
             elif sums[v, 0] >= MANY:
-                for c in range(10):
+                for c in range(SUMS):
                     sums[v, c] *= 0.5
             x, y, z = side * (x - i - 0.5), side * (y - j - 0.5), side * (z - k - 0.5)
             sums[v, 0] += 1.0
@@ -130,6 +142,7 @@ def _insert_kernel(
             sums[v, 7] += y * y
             sums[v, 8] += y * z
             sums[v, 9] += z * z
+            sums[v, WHEN] += sweep
             flags[v] = OLD
     return points.shape[0], count
 
@@ -161,6 +174,7 @@ class PlaneMap:
     Attributes:
         table, keys, sums, flags, means, normals: arrays of the voxels, for kernels; the first
             `len` rows count.
+        sweeps: how many were added.
     """
 
     def __init__(self, voxel: float, sigma: float) -> None:
@@ -172,12 +186,12 @@ class PlaneMap:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._size = 0
+        self._size = self.sweeps = 0
         self._make(FIRST_ROOM)
 
     def _make(self, room: int) -> None:
         self.table, self.keys = new_table(room), np.empty(room, np.int64)
-        self.sums, self.flags = np.empty((room, 10)), np.zeros(room, np.int8)
+        self.sums, self.flags = np.empty((room, SUMS)), np.zeros(room, np.int8)
         self.means, self.normals = np.empty((room, 4)), np.empty((room, 3))
 
     def insert(self, points: Array) -> None:
@@ -185,11 +199,12 @@ class PlaneMap:
         inside = 0.25 * FURTHEST * self.voxel
         if len(points) and not float(np.abs(points).max()) < inside:
             points = points[np.abs(points).max(axis=1) < inside]
-        done = 0
+        done, self.sweeps = 0, self.sweeps + 1
         while True:
             done, self._size = _insert_kernel(
-                points, done, self.voxel, self.table, self.keys, self.sums, self.flags, self._size
-            )
+                points, done, self.voxel, self.table, self.keys, self.sums, self.flags, self._size,
+                float(self.sweeps),
+            )  # fmt: skip
             if done == len(points):
                 return
             self._keep(np.arange(self._size), 2 * self._size + 2)

@@ -6,18 +6,15 @@ means μ and normals n in units of their thickness (`planemap`),
     T* = argmin Σ ρ_k(r²(T p)),     r = nᵀ (μ - T p),     ρ_k(s) = k s / (k + s),
 
 where a point belongs to the small voxel that it lies in, or if that has no plane to the large one;
-at first also to the nearest beside them. ρ is Geman and McClure's; k begins wide, as far as the
-guess may be off, and narrows to what noise can do, so that what moved by itself counts for nothing
-in the end.
+at first also to the nearest beside them. ρ is Geman and McClure's; k narrows from how far the guess
+may be off to what noise can do, so that what moved by itself counts for nothing in the end.
 
-How sure the result is: H = Σ w a aᵀ, a = (n, x × n), counts each point as a witness of its own.
-Those of one voxel share the error of its mean and normal; who uses H says how many are one witness.
-
-Normals are noisy, and a thousand that are tilted by chance hold a body along a tunnel, where the
-rings of its beams lie now. So what tilts pretend is taken off H, and where little is left, nothing
-is known (`degeneracy`). Along such directions, W, it stays as near to the guess as it can: in the
-metric M of how bodies move, H gets β M W (Wᵀ M W)⁻¹ Wᵀ M, with β large. Not in that of how points
-move: before a wall far ahead, which fixes yaw, a body would go sideways for its points to stay.
+H = Σ w a aᵀ, a = (n, x × n), counts each point as a witness of its own; who uses it says how many
+are one. What tilts of noisy normals pretend is taken off (`degeneracy`). Tangents W of which little
+is left stay as near to the guess as they can, in the metric M of how bodies move: H gets β M W
+(Wᵀ M W)⁻¹ Wᵀ M. Not in that of how points move: before a wall far ahead a body that turns would go
+sideways for its points to stay. An error w of a sweep stays in the map by (Σ w A a aᵀ)⁻¹ H, A being
+the age of surfaces in sweeps: with x = Σ_j a_j x_j + w, errors go on by w / Σ_j j a_j.
 
 Cost: 0.25 µs a point and step, 4 to 10 steps, and 0.3 ms for what is known.
 
@@ -40,6 +37,7 @@ from odomap.lidar.planemap import (
     OLD,
     SURFACE,
     TILT,
+    WHEN,
     PlaneMap,
     plane_kernel,
 )
@@ -51,6 +49,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Flags = NDArray[np.int8]
 
+GRAZING2 = 0.03**2
+"""κ²: squared sine of the incidence at which a point counts half."""
 STEPS = 20
 """Most that are taken."""
 STILL = 1e-3, 2e-5
@@ -63,9 +63,9 @@ FEWEST = 30
 """Points on surfaces below which nothing can be said."""
 INLIER = 9.0
 """r² of points that lie on something."""
-SEEN = 0.008
-"""Share of a motion that must be seen across surfaces. Tunnels show 0.004 at most, since voxels are
-not planes; streets 0.03 and more."""
+SEEN = 0.005
+"""Share of a motion that must be seen across surfaces. Tunnels show 0.002, hardly ever 0.006, since
+voxels are not planes; streets 0.03 and more, at first, with 16 beams, 0.008."""
 ASKED = 600
 """Points that say what is known: more say no more."""
 LEAST = 1e-9
@@ -85,6 +85,8 @@ class PlaneMatch:
         information: (6, 6) inverse covariance of a right update, of points that are each a witness
             of its own; zero along what is weak.
         weak: (K, 6) tangents of the body of which nothing is known.
+        stays: (6, 6) what an error of a sweep like it leaves in the map, as is seen from then on.
+        bends: (6, 6) how far it is off per tangent by which points are, each by its share.
         on: how many points lie on something.
         mean: their mean square, in variances.
         is_still: whether it came to rest.
@@ -93,6 +95,8 @@ class PlaneMatch:
     T_map_body: Array
     information: Array
     weak: Array
+    stays: Array
+    bends: Array
     on: int
     mean: float
     is_still: bool
@@ -148,6 +152,19 @@ def _voxel_of(
 
 
 @kernel
+def _weight(x: float, y: float, z: float, a: float, b: float, c: float, tilt2: float) -> float:
+    """s⁴ / (s⁴ + (κ² + (3 δ)²)²) of a beam (x, y, z) that meets a plane (a, b, c) at a sine of s.
+
+    Through leaves a beam draws a plane, its own path, which turns with the LiDAR and would hold its
+    tilt; a surface is met under an angle, of more than the normal is unsure by, δ.
+    """
+    into = (a * x + b * y + c * z) ** 2
+    most = (a * a + b * b + c * c) * (x * x + y * y + z * z)
+    along = (GRAZING2 + 9.0 * tilt2) * most
+    return float(into * into / (into * into + along * along))
+
+
+@kernel
 def _sum_kernel(
     points: Array, R: Array, t: Array, size: float, table: Index, keys: Index, sums: Array,
     flags: Flags, means: Array, normals: Array, sigma2: float, k: float, total: Array,
@@ -169,6 +186,8 @@ def _sum_kernel(
         a, b, c = normals[v, 0], normals[v, 1], normals[v, 2]
         r = a * (means[v, 0] - x - t[0]) + b * (means[v, 1] - y - t[1])
         r += c * (means[v, 2] - z - t[2])
+        q = np.sqrt(_weight(x, y, z, a, b, c, means[v, TILT]))
+        a, b, c, r = q * a, q * b, q * c, q * r
         w = k / (k + r * r)
         w *= w
         add_plane(x, y, z, a, b, c, r, w, total)
@@ -210,12 +229,15 @@ def _match_kernel(
 
 @kernel
 def _known_kernel(
-    points: Array, R: Array, t: Array, size: float, table: Index, keys: Index, sums: Array,
-    flags: Flags, means: Array, normals: Array, sigma2: float, known: Array,
+    points: Array, bent: Array, sweeps: float, R: Array, t: Array, size: float, table: Index,
+    keys: Index, sums: Array, flags: Flags, means: Array, normals: Array, sigma2: float,
+    known: Array,
 ) -> int:  # fmt: skip
-    """known (3, SLOTS) ← sums of w a aᵀ, of w δ² Jᵀ (I - n nᵀ) J, of w Jᵀ J; of how many points.
+    """known (5, SLOTS) ← sums over points, the number of which it returns.
 
-    Of many points some are asked, and the sums are as if all were.
+    Of w a aᵀ, of w δ² Jᵀ (I - n nᵀ) J, of w Jᵀ J; of w a aᵀ times the age of the surface, as many
+    sweeps ago as it was seen in the mean; and times the point's share of what bends the sweep. Of
+    many points some are asked, and the sums are as if all were.
     """
     on, every = 0, points.shape[0] // ASKED + 1
     for n in range(0, points.shape[0], every):
@@ -231,6 +253,8 @@ def _known_kernel(
         a, b, c = normals[v, 0], normals[v, 1], normals[v, 2]
         r = a * (means[v, 0] - x - t[0]) + b * (means[v, 1] - y - t[1])
         r += c * (means[v, 2] - z - t[2])
+        q = np.sqrt(_weight(x, y, z, a, b, c, means[v, TILT]))
+        a, b, c, r = q * a, q * b, q * c, q * r
         if not r * r < INLIER:
             continue
         w = NARROW / (NARROW + r * r)
@@ -243,24 +267,31 @@ def _known_kernel(
             -d * w * b * c, d * (m - w * c * c), 0.0, 0.0, 0.0, known[1],
         )  # fmt: skip
         add_metric(x, y, z, m, 0.0, 0.0, m, 0.0, m, 0.0, 0.0, 0.0, known[2])
+        age = sweeps + 1.0 - sums[v, WHEN] / sums[v, 0]
+        add_plane(x, y, z, a, b, c, 0.0, w * age, known[3])
+        add_plane(x, y, z, a, b, c, 0.0, w * bent[n], known[4])
         on += 1
     return on
 
 
-def match_planes(surfaces: PlaneMap, points: Array, T_map_body: Array, wide: float) -> PlaneMatch:
+def match_planes(
+    surfaces: PlaneMap, points: Array, bent: Array, T_map_body: Array, wide: float
+) -> PlaneMatch:
     """Lay points onto surfaces.
 
     Args:
         surfaces: of sweeps before.
         points: (N, 3) seen from the body at one instant.
+        bent: (N,) shares of a tangent, the same for all, by which they may be off.
         T_map_body: (4, 4) first guess.
         wide: how far off surfaces points may be then, standard deviations, squared.
     """
-    match, hold = _match(surfaces, points, T_map_body, wide, np.zeros(21))
+    seen = points, bent, wide
+    match, hold = _match(surfaces, seen, T_map_body, np.zeros((6, 6)))
     if len(match.weak) == 6:
         return replace(match, T_map_body=T_map_body)
     if len(match.weak):  # it went where tilts led it
-        match, _ = _match(surfaces, points, T_map_body, wide, hold)
+        match, _ = _match(surfaces, seen, T_map_body, hold)
     return match
 
 
@@ -280,36 +311,39 @@ def lying(surfaces: PlaneMap, points: Array, T_map_body: Array) -> tuple[int, fl
 
 
 def _match(
-    surfaces: PlaneMap, points: Array, T_map_body: Array, wide: float, hold: Array
+    surfaces: PlaneMap, seen: tuple[Array, Array, float], T_map_body: Array, hold: Array
 ) -> tuple[PlaneMatch, Array]:
     """Lay points onto surfaces with some tangents held; what is to be held, of what is weak."""
-    s = surfaces
+    s, (points, bent, wide) = surfaces, seen
     R, t = np.ascontiguousarray(T_map_body[:3, :3]), np.array(T_map_body[:3, 3])
-    total, known = np.zeros(SLOTS), np.zeros((3, SLOTS))
+    total, known = np.zeros(SLOTS), np.zeros((5, SLOTS))
     arrays = s.voxel, s.table, s.keys, s.sums, s.flags, s.means, s.normals, s.sigma**2
-    on, is_still, _ = _match_kernel(points, R, t, *arrays, wide, hold, total)
+    held = hold[np.triu_indices(6)]
+    on, is_still, _ = _match_kernel(points, R, t, *arrays, wide, held, total)
     T, turned = np.eye(4), np.zeros((6, 6))
     T[:3, :3], T[:3, 3] = R, t
     turned[:3, :3] = turned[3:, 3:] = R
     mean = float(total[COST] / max(total[COUNT], 1e-9))
-    if _known_kernel(points, R, t, *arrays, known) < FEWEST:
-        return PlaneMatch(T, np.zeros((6, 6)), np.eye(6), on, mean, False), hold
-    H, noise, motion = (_symmetric(row) for row in known)
+    if _known_kernel(points, bent, float(s.sweeps), R, t, *arrays, known) < FEWEST:
+        none = np.zeros((6, 6))
+        return PlaneMatch(T, none, np.eye(6), np.eye(6), none, on, mean, False), hold
+    H, noise, motion, aged, bending = (_symmetric(row) for row in known)
     motion += LEAST * np.diag(np.repeat([motion[0, 0], np.trace(motion[3:, 3:])], 3))
     root, weak = known_part(H - noise, noise, motion, SEEN)
-    root = turned.T @ root
-    match = PlaneMatch(T, root @ root.T, weak @ turned, on, mean, is_still)
-    return match, _holding(motion, weak)
+    root, hold, tiny = turned.T @ root, _holding(motion, weak), LEAST * motion
+    stays = turned.T @ np.linalg.solve(aged + tiny, H + tiny) @ turned
+    bends = turned.T @ np.linalg.solve(H + hold + tiny, bending) @ turned
+    match = PlaneMatch(T, root @ root.T, weak @ turned, stays, bends, on, mean, is_still)
+    return match, hold
 
 
 def _holding(motion: Array, weak: Array) -> Array:
-    """Return what (21,) is added to H for the tangents (K, 6) to be held."""
+    """Return what (6, 6) is added to H for the tangents (K, 6) to be held."""
     if not len(weak):
-        return np.zeros(21)
+        return np.zeros((6, 6))
     unlikely = motion[0, 0] * np.diag(np.repeat([1.0, LEVER**2], 3))
     moved = unlikely @ weak.T
-    held = HELD * moved @ np.linalg.solve(weak @ moved, moved.T)
-    return np.asarray(held[np.triu_indices(6)])
+    return np.asarray(HELD * moved @ np.linalg.solve(weak @ moved, moved.T))
 
 
 def _symmetric(total: Array) -> Array:
@@ -324,5 +358,5 @@ def warm_up() -> None:
     surfaces = PlaneMap(1.0, 0.05)
     points = np.array([[x, y, 0.01 * x * y] for x in range(7) for y in range(7)]) / 7.0
     surfaces.insert(points)
-    match_planes(surfaces, points, np.eye(4), 9.0)
+    match_planes(surfaces, points, np.zeros(len(points)), np.eye(4), 9.0)
     lying(surfaces, points, np.eye(4))

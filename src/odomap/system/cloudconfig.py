@@ -44,12 +44,22 @@ class CloudTrackingConfig:
     """Standard deviation of a velocity of which nothing is known, m/s."""
     unknown_rad: Positive = 1.0
     """The same of a rotation, rad/s."""
+    unsteady: Positive = 0.08
+    """Standard deviation of how a velocity changes from sweep to sweep, until it is seen, m/s."""
+    unsteady_rad: Positive = 0.015
+    """The same of a rotation, rad/s."""
     unseen: Positive = 2.0
     """Standard deviation of a velocity that nobody saw for a while, m/s."""
     unseen_rad: Positive = 0.5
     """The same of a rotation, rad/s."""
     renewal: NotNegative = 1.0
-    """Share of a step's error that goes into the map, and stays."""
+    """Share of a sweep's error that stays in the map, squared, where a front-end does not say."""
+    drift: NotNegative = 0.001
+    """What a metre of the way adds to errors whatever points say, as no model of a LiDAR is exact:
+    standard deviation over the square root of the way, m/√m. Of a LiDAR that is badly calibrated
+    it is more."""
+    drift_rad: NotNegative = 3e-5
+    """The same of a rotation, rad/√m."""
     seeks_after: Count = 3
     """Sweeps in a row that are placed nowhere, after which the whole map is searched for them."""
     around: Positive = 50.0
@@ -125,6 +135,11 @@ class CloudClosingConfig:
     """The same, relative to all keyframes."""
     solve_off: Positive = 0.5
     """How far off the path a new loop is for it to be solved at once, metres."""
+    slack: NotNegative = 0.003
+    """How much more than they say steps of odometry may err while it is decided which loops are
+    true, m/√m: a real LiDAR errs by what it knows nothing of."""
+    slack_rad: NotNegative = 5e-4
+    """The same of a rotation, rad/√m."""
     doubt: Positive = 4.0
     """Factor on all standard deviations while it is decided which loops are true."""
     outlying: Positive = 10.0

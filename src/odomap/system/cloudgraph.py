@@ -7,6 +7,10 @@ of them the others and the path contradict (`loopgraph`). Loops that are new are
 others before any is written; those that do not hold are named, new ones as refused, earlier ones as
 not believed any more.
 
+Steps say what the map of odometry drifted by between two keyframes, not what either sweep was off
+by itself, which is white and comes on top of the marginals (`cloudmotion`). Real LiDARs err by what
+none of them knows; so while it is decided on loops, steps are taken to be less sure than they say.
+
 Across gaps nothing was measured; an edge that draws nothing keeps the graph in one piece until
 loops tie the two. Covariances are the graph's marginals, relative to the first keyframe.
 
@@ -17,7 +21,7 @@ spatial perception", RA-L 5(2), 2020.
 """
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +40,8 @@ Index = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Pair = tuple[int, int]
 
+SHORTEST = 0.1
+"""Length that a step is taken to have at least, metres."""
 UNKNOWN = np.diag([1e-4] * 3 + [0.1] * 3)
 """Information of the step from one piece of the map to the next: it keeps the graph in one."""
 
@@ -112,11 +118,23 @@ class CloudGraph:
             decides: whether it is decided anew which loops are false.
         """
         limits = config.doubt, config.outlying
-        solved = solve_loops(self._graph(), self.is_false, *limits, decides)
+        graph = self._graph()
+        loose = replace(graph, information=self._loosened(config))
+        solved = solve_loops(graph, self.is_false, *limits, decides, deciding=loose)
         Ts, is_false = np.array(solved.Ts_world_node), ~solved.is_true
         Ts[:, :3, :3] = orthonormalize(Ts[:, :3, :3])
         false = zip(self.j[is_false].tolist(), self.i[is_false].tolist(), strict=True)
         return CloudPath(self.keyframe_ids, Ts, solved.covariances, frozenset(false))
+
+    def _loosened(self, config: CloudClosingConfig) -> Array:
+        """Return the information (E, 6, 6) with which it is decided which loops are true."""
+        loosened = np.array(self.information)
+        steps = np.flatnonzero(~self.is_loop)
+        length = np.linalg.norm(self.Ts_i_j[steps, :3, 3], axis=1)
+        slack = np.repeat([config.slack, config.slack_rad], 3) ** 2
+        more = np.maximum(length, SHORTEST)[:, None, None] * np.diag(slack)
+        loosened[steps] = np.linalg.inv(np.linalg.inv(loosened[steps]) + more)
+        return loosened
 
     def _graph(self) -> EssentialGraph:
         """Return the graph of keyframes, the first of which stays."""

@@ -5,19 +5,19 @@ information) is weighed against how a body can move, with V the covariance of ξ
 
     D = (V + diag(σ_a, σ_ω)² Δt²) Δt²,    P_step = (D⁻¹ + Λ)⁻¹,    V ← P_step / Δt²
 
-Along a tunnel Λ is zero. There ξ stays what it was, and how unsure it is grows; and as one error of
-ξ makes all steps too long, errors of steps do not average out. With A = P_step D⁻¹ the share of an
-old error that a step still has, and C the covariance of place and step,
+Along a tunnel Λ is zero: ξ stays what it was, and one error of it makes all steps too long. With
+A = P_step D⁻¹ the share of an old error that a step still has, C the covariance of place and step,
+and S = A + s (I - A) what of a sweep's error stays in the map, one over its age (`planematching`),
 
-    P ← Ad P Adᵀ + P_step + C Aᵀ + A Cᵀ,    C ← Ad (C Aᵀ + P_step).
+    P ← Ad P Adᵀ + S P_own Sᵀ + C Aᵀ + A Cᵀ,   C ← Ad (C Aᵀ + S P_step),   P_own = P_step + B U Bᵀ,
 
-Where walls fix everything A is nearly zero, and steps are independent of each other. C runs on
-through keyframes: so their covariances along a path add up to what they should.
+U being by what rates change from sweep to sweep, and B how that bends a sweep. So P, of the steps
+from keyframe to keyframe, is what the map drifts by, with a floor for each metre. What a sweep errs
+by itself, (I - S) P_own (I - S)ᵀ, is white and belongs to the frame alone: along a path it does not
+add up, but for the first one, where all is counted from. C runs on through keyframes.
 
-Clocks jump. A stamp before the last one, or hardly after it, tells no time: a sweep then takes as
-long as is usual.
-A body that was not seen for long may be anywhere, and one that was carried off is, too: then much
-less than before lies on what is known, and not where it should.
+A stamp before the last one, or hardly after it, tells no time: a sweep takes as long as is usual. A
+body not seen for long may be anywhere; of one that was carried off much less lies on what is known.
 
 Reference: T. D. Barfoot, "State estimation for robotics", Cambridge 2017, section 10.1 (a motion
 with white noise on acceleration).
@@ -108,7 +108,8 @@ class CloudMotion:
         self.T_odom_middle, self.twist = T_odom_middle, np.zeros(6)
         self._V = np.diag(np.repeat([config.unknown, config.unknown_rad], 3) ** 2)
         self._C, self.since = np.zeros((6, 6)), np.zeros((6, 6)) if sure is None else sure
-        self._unsteady2 = np.zeros(6)
+        self._unsteady2 = np.repeat([config.unsteady, config.unsteady_rad], 3) ** 2
+        self.own = np.zeros((6, 6))
         self._share, self._square, self._count, self._misfit = (_Usual() for _ in range(4))
         self._gone, self._shaken, self._was_fixed = 0, 0, False
         self._middle_ns = max(middle_ns, self._middle_ns)
@@ -217,15 +218,21 @@ class CloudMotion:
         Ad = se3_adjoint(se3_inverse(se3_inverse(self.T_odom_middle) @ match.T_map_body))
         shared = Ad @ self._C @ kept.T
         grown = Ad @ self.since @ Ad.T + _grown(shared + shared.T)
-        if fixed:
-            grown = _together(grown + loose, match.information)
-        else:
-            grown = grown + self._config.renewal * step
-        self._C = shared + step
         is_off = self._is_off(match, seconds)
         self._shaken = AFTERWARDS if is_off else max(self._shaken - 1, 0)
         if self._gone:
             self._unsteady2 += LEARNING * ((twist - self.twist) ** 2 - self._unsteady2)
+        if fixed:
+            grown = _together(grown + loose, match.information)
+            self.own = self._own(match, step, np.eye(6), seconds / 8.0)
+            self._C = shared + step
+        else:
+            stays = self._stays(match, kept)
+            grown = grown + self._own(match, step, stays, 0.0) + self._drift(match)
+            if not self._gone:  # all is counted from the first, deskewed by the motion after it
+                grown = grown + self._own(match, step, np.eye(6), seconds * 3.0 / 8.0)
+            self.own = self._own(match, step, np.eye(6) - stays, seconds / 8.0)
+            self._C = shared + stays @ step
         self._gone, self._was_fixed = self._gone + 1, is_fixed(match)
         self.since = grown
         self._misfit.learn(self._misfit_of(match))
@@ -237,9 +244,30 @@ class CloudMotion:
             usual = self._usual_s or seconds
             self._V, self._usual_s = step / seconds**2, usual + LEARNING * (seconds - usual)
         self._middle_ns = max(middle_ns, self._middle_ns + round(seconds * 1e9))
-        # By how much a motion that is not constant errs, ½ a (Δt/2)², here and at the keyframe.
-        shaken = 2.0 * np.diag(self._unsteady2) * (seconds / 8.0) ** 2
-        return np.asarray(grown + step + shaken)
+        return np.asarray(grown + self.own)
+
+    def _own(self, match: SweepMatch, step: Array, part: Array, since: float) -> Array:
+        """Return the covariance (6, 6) of a part (6, 6) of a sweep's own error.
+
+        A change Δξ of the motion from sweep to sweep bends a sweep; where the body was half a sweep
+        before its middle, at the stamp, is off by ⅛ Δξ Δt, which is the time given.
+        """
+        bends = np.zeros((6, 6)) if match.bends is None else match.bends
+        bent = part @ bends + since * np.eye(6)
+        return np.asarray(part @ step @ part.T + bent @ np.diag(self._unsteady2) @ bent.T)
+
+    def _drift(self, match: SweepMatch) -> Array:
+        """Return the covariance (6, 6) that a step adds whatever points say."""
+        config = self._config
+        way = np.linalg.norm(match.T_map_body[:3, 3] - self.T_odom_middle[:3, 3])
+        return np.asarray(way * np.diag(np.repeat([config.drift, config.drift_rad], 3) ** 2))
+
+    def _stays(self, match: SweepMatch, kept: Array) -> Array:
+        """Return what (6, 6) of the error of a sweep stays in the map."""
+        stays = match.stays
+        if stays is None:
+            stays = np.sqrt(self._config.renewal) * np.eye(6)
+        return np.asarray(kept + stays @ (np.eye(6) - kept))
 
     def _loose(self, seconds: float, unseen: bool) -> Array:
         """Return the covariance (6, 6) of a step before it is matched."""

@@ -56,8 +56,9 @@ UNKNOWN = np.zeros(6), np.zeros((6, 6))
 """A motion of which nothing is known, and its information."""
 GLIMPSE_S = 0.5
 """Longest time between two sweeps that show how a body moves of which nothing else is known."""
-AGAIN = 2
-"""How often the first sweep is laid down again, each time with the motion found before."""
+AGAIN, AS_BEFORE = 15, np.array([1e-2] * 3 + [1e-3] * 3)
+"""How often at most the first sweep is laid down again, each time with the motion found before; and
+by how much that is another motion, metres and radians per second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +205,8 @@ class CloudTracker:
             motion.T_odom_middle, motion.twist = se3_exp(first.middle * twist), twist
             self._front_end.insert(first.prepared, motion.T_odom_middle, twist)
             laid = self._layer.lay(view, seconds)
+            if (np.abs(laid.twist - twist) < AS_BEFORE).all():
+                break
         self._T_odom_keyframe = self._motion.T_odom_middle @ se3_exp(-first.middle * laid.twist)
         return laid
 
@@ -324,12 +327,14 @@ class CloudTracker:
     def _add_keyframe(self, wanted: _Wanted) -> int:
         """Add the sweep that was placed last to the map, tied to the keyframe before."""
         view, last = wanted.view, self.path.last
-        in_world = self.path.covariance(last)
+        since, own = self._motion.since, self._motion.own
+        hung = Placed(last.stamp_ns, last.keyframe_id, last.T_keyframe_body, since)
+        in_world = self.path.covariance(hung)
         k = self._new_keyframe(view, self.path.last_pose(), in_world, wanted.twist)
-        information = np.asarray(np.linalg.inv(last.covariance))
+        information = np.asarray(np.linalg.inv(since))
         self._map.add_edge(last.keyframe_id, k, last.T_keyframe_body, information, self._tie)
         self._tie = ODOMETRY
-        self.path.replace_last(Placed(view.frame.stamp_ns, k, np.eye(4), np.zeros((6, 6))))
+        self.path.replace_last(Placed(view.frame.stamp_ns, k, np.eye(4), own))
         return k
 
     def _new_keyframe(

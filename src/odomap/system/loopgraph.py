@@ -54,6 +54,7 @@ def solve_loops(
     outlying: float,
     decides: bool,
     gnc: GncConfig | None = None,
+    deciding: EssentialGraph | None = None,
 ) -> SolvedLoops:
     """Find the poses that agree best with steps and loops.
 
@@ -64,10 +65,11 @@ def solve_loops(
         outlying: standard deviations at which a loop counts half.
         decides: whether it is decided anew.
         gnc: how.
+        deciding: the same graph with what is known while it is decided, if that is less.
     """
     is_true = ~is_false
     if decides and graph.is_doubted.any():
-        inliers = find_inliers(graph, np.full(graph.num_edges, doubt**-2), gnc)
+        inliers = find_inliers(deciding or graph, np.full(graph.num_edges, doubt**-2), gnc)
         is_true = inliers.is_inlier | ~graph.is_doubted
         graph = graph.placed(inliers.Ts_world_node)
     solution = solve(
