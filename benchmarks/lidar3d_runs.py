@@ -50,9 +50,11 @@ class LastSweeps:
         """Make a sweep ready."""
         return self._inner.prepare(sweep)
 
-    def match(self, prepared: Any, T_map_body: Array, twist: Array) -> SweepMatch:
+    def match(
+        self, prepared: Any, T_map_body: Array, twist: Array, again: bool = False
+    ) -> SweepMatch:
         """Lay a sweep onto the last ones."""
-        return self._inner.match(prepared, T_map_body, twist)
+        return self._inner.match(prepared, T_map_body, twist, again)
 
     def insert(self, prepared: Any, T_map_body: Array, twist: Array) -> None:
         """Make the map anew of the last sweeps, and this one."""

@@ -222,3 +222,19 @@ def test_traces_of_beams_through_leaves_do_not_hold_a_body(pitch):
         front_end.prepare(sweep(np.concatenate([seen, leaves()]))), np.eye(4), np.zeros(6)
     )
     assert se3_log(match.T_map_body)[4] == pytest.approx(pitch, abs=0.15 * abs(pitch))
+
+
+def test_between_upright_walls_alone_a_lidar_that_stands_stays_where_it_is():
+    rng = np.random.default_rng(0)
+    tilt, phi = np.meshgrid(np.radians(np.arange(-15, 16, 2.0)), np.linspace(-np.pi, np.pi, 1500))
+    far = 8.0 / np.maximum(np.abs(np.cos(phi)), np.abs(np.sin(phi)))  # a room without a floor
+    box = np.stack([far * np.cos(phi), far * np.sin(phi), far * np.tan(tilt)], axis=-1)
+    front_end = PlaneFrontEnd()
+    for k in range(8):
+        ready = front_end.prepare(sweep(box.reshape(-1, 3)[rng.random(box.size // 3) < 0.9]))
+        match = front_end.match(ready, np.eye(4), np.zeros(6))
+        if k:
+            assert match.share > 0.5
+            assert "translation" in match.reason  # of height nothing is known
+            assert np.linalg.norm(match.T_map_body[:3, 3]) < 0.01
+        front_end.insert(ready, np.eye(4), np.zeros(6))

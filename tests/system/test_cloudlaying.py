@@ -43,7 +43,7 @@ class Stubborn:
     def prepare(self, sweep):
         return sweep
 
-    def match(self, prepared, T_map_body, twist):
+    def match(self, prepared, T_map_body, twist, again=False):
         self.asked += 1
         off = np.linalg.norm(se3_log(se3_inverse(T_map_body) @ self.T)[:3])
         if off < self.reach:

@@ -125,18 +125,22 @@ class LocalFeatures:
         T_map_body: Array,
         twist: Array,
         stages: tuple[FeatureStage, ...],
+        again: bool,
     ) -> SweepMatch:
-        """Find where a sweep was taken; arguments as those of a front-end, and the stages."""
+        """Find where a sweep was taken; arguments as those of a front-end, and the stages.
+
+        Of these a sweep that is matched again needs the last alone.
+        """
         self._lay_first(twist)
         points = deskew(prepared.points, prepared.times, twist)
         rest = points, prepared.kinds, self.planes, self.edges
         common = UNSURE if self._age <= YOUNG else 1.0
-        found = match_features(*rest, T_map_body, stages, common)
-        if self._age <= YOUNG or found.share < POOR * self._share:
+        found = match_features(*rest, T_map_body, stages[-1:] if again else stages, common)
+        if not again and (self._age <= YOUNG or found.share < POOR * self._share):
             guess = self._from_last(prepared, points, T_map_body, twist)
-            again = found if guess is None else match_features(*rest, guess, stages, common)
-            is_young = self._age <= YOUNG and again.converged
-            found = again if is_young or again.num_inliers > found.num_inliers else found
+            other = found if guess is None else match_features(*rest, guess, stages, common)
+            is_young = self._age <= YOUNG and other.converged
+            found = other if is_young or other.num_inliers > found.num_inliers else found
         self._share = found.share
         return found
 

@@ -66,13 +66,17 @@ class FrontEnd(Protocol[P]):
         """Make a sweep ready without looking at the map."""
         ...
 
-    def match(self, prepared: P, T_map_body: Array, twist: Array) -> SweepMatch:
+    def match(
+        self, prepared: P, T_map_body: Array, twist: Array, again: bool = False
+    ) -> SweepMatch:
         """Find where a sweep was taken.
 
         Args:
             prepared: the sweep.
             T_map_body: (4, 4) first guess of the body at the stamp.
             twist: (6,) how the body moves over the sweep, per second.
+            again: whether the guess is what a match of this sweep found, with another motion: then
+                it is near, and what is found is to be exact.
         """
         ...
 

@@ -68,7 +68,9 @@ class LegoFrontEnd:
         marks = pick(lines, c, reach, may, config.curvature)
         return features_of(sweep, lines, marks, is_ground)
 
-    def match(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> SweepMatch:
+    def match(
+        self, prepared: FeatureSweep, T_map_body: Array, twist: Array, again: bool = False
+    ) -> SweepMatch:
         """Find where a sweep was taken; see `frontend`."""
         limits = self._config.map
         stages = (
@@ -77,7 +79,7 @@ class LegoFrontEnd:
             FeatureStage(reach=limits.reach, iterations=4),
             FeatureStage(reach=NEAR, iterations=limits.iterations),
         )
-        return self._map.match(prepared, T_map_body, twist, stages)
+        return self._map.match(prepared, T_map_body, twist, stages, again)
 
     def insert(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> None:
         """Add a sweep to the map, and forget what is far from it."""

@@ -55,14 +55,16 @@ class LoamFrontEnd:
         marks = pick(lines, c, reach, may, self._config.curvature)
         return features_of(sweep, lines, marks, np.zeros(len(c), np.bool_))
 
-    def match(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> SweepMatch:
+    def match(
+        self, prepared: FeatureSweep, T_map_body: Array, twist: Array, again: bool = False
+    ) -> SweepMatch:
         """Find where a sweep was taken; see `frontend`."""
         limits = self._config.map
         stages = (
             FeatureStage(reach=limits.reach, iterations=4),
             FeatureStage(reach=NEAR, iterations=limits.iterations),
         )
-        return self._map.match(prepared, T_map_body, twist, stages)
+        return self._map.match(prepared, T_map_body, twist, stages, again)
 
     def insert(self, prepared: FeatureSweep, T_map_body: Array, twist: Array) -> None:
         """Add a sweep to the map, and forget what is far from it."""

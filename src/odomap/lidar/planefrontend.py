@@ -65,17 +65,21 @@ class PlaneFrontEnd:
         points, times = sweep.points[rows], sweep.times[rows]
         return ThinSweep(points, times, first_in_voxels(points, config.matched * voxel))
 
-    def match(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> SweepMatch:
-        """Find where a sweep was taken."""
+    def match(
+        self, prepared: ThinSweep, T_map_body: Array, twist: Array, again: bool = False
+    ) -> SweepMatch:
+        """Find where a sweep was taken; see `frontend`."""
         rows = prepared.matched
         points = deskew(prepared.points[rows], prepared.times[rows], twist)
         if self._map is None or len(points) == 0:
             return SweepMatch(T_map_body, np.zeros((6, 6)), 0, len(points), 0.0, False, "no map")
         surfaces, config = self._map, self._config
-        wide = 9.0 * (1.0 + self._off2 / surfaces.sigma**2)
+        off2 = 0.0 if again else self._off2
+        wide = 9.0 * (1.0 + off2 / surfaces.sigma**2)
         bent = _bent(prepared.times[rows])
         found = match_planes(surfaces, points, bent, T_map_body, wide)
-        self._note(T_map_body, found.T_map_body, points)
+        if not again:
+            self._note(T_map_body, found.T_map_body, points)
         information = found.information / (config.alike * max(found.mean, config.least_spread))
         error = surfaces.sigma * float(np.sqrt(found.mean))
         return SweepMatch(

@@ -116,8 +116,8 @@ class CloudLayer:
         self, front_end: FrontEnd[Any], prepared: Any, T: Array, twist: Array, seconds: float
     ) -> Laid:
         """Lay a sweep down from a guess, and again with the motion that this gives."""
-        for _ in range(self._config.rounds):
-            match = front_end.match(prepared, T, twist)
+        for n in range(self._config.rounds):
+            match = front_end.match(prepared, T, twist, again=n > 0)
             T = match.T_map_body
             twist = self._motion.twist_to(T, seconds)
         return Laid(match, twist)
