@@ -37,6 +37,19 @@ def panels(count: int, width: float = 9.6, height: float = 3.2, gap: float = 0.2
     return figure, figure.subplots(1, count, gridspec_kw={"wspace": gap})
 
 
+def save_figures(figures: tuple[Callable[[], Figure], ...], names: list[str]) -> None:
+    """Draw all figures, or those named, and keep them beside this file."""
+    for draw in figures:
+        if names and draw.__name__ not in names:
+            continue
+        if draw is epipolar:  # a photograph
+            (HERE / "epipolar.jpg").write_bytes(figure_jpeg(draw(), 85))
+            continue
+        picture = Image.open(io.BytesIO(figure_png(draw(), 110))).convert("RGB")
+        small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        small.save(HERE / f"{draw.__name__}.png", optimize=True)
+
+
 def factor_graph() -> Figure:
     """Poses, landmarks, and what was measured between them."""
     figure = Figure(figsize=(8.4, 3.0), facecolor=PALETTE["paper"])
@@ -311,17 +324,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )  # fmt: skip
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for draw in FIGURES:
-        if not names or draw.__name__ in names:
-            if draw is epipolar:  # a photograph
-                (HERE / "epipolar.jpg").write_bytes(figure_jpeg(draw(), 85))
-                continue
-            picture = Image.open(io.BytesIO(figure_png(draw(), 110))).convert("RGB")
-            small = picture.quantize(128, dither=Image.Dither.NONE)
-            small.save(HERE / f"{draw.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

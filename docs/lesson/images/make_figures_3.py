@@ -3,21 +3,19 @@
 All of them come from simulated worlds and from the examples, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, MUTED, ORANGE, RED, example, panels
+from make_figures import BLUE, GREEN, GREY, INK, MUTED, ORANGE, RED, example, panels, save_figures
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
-from PIL import Image
 
 import odomap
 from odomap.views.covisibility import MapView
-from odomap.views.style import PALETTE, dress, figure_png
+from odomap.views.style import PALETTE, dress
 from odomap.vision.orb import OrbConfig, extract
 
 
@@ -267,14 +265,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )  # fmt: skip
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for draw in FIGURES:
-        if not names or draw.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(draw(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{draw.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

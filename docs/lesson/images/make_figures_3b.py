@@ -3,20 +3,18 @@
 All of them come from simulated worlds and from the examples, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, ORANGE, RED, example, panels
+from make_figures import BLUE, GREEN, GREY, INK, ORANGE, RED, example, panels, save_figures
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
 
 import odomap
-from odomap.views.style import dress, figure_png, new_figure
+from odomap.views.style import dress, new_figure
 from odomap.vision.features import Features
 from odomap.vision.orb import OrbConfig, extract
 
@@ -156,14 +154,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for make in FIGURES:
-        if not names or make.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(make(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{make.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

@@ -3,18 +3,16 @@
 All of them come from simulated worlds and from the examples, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, MUTED, ORANGE, RED, example, panels
+from make_figures import BLUE, GREEN, GREY, INK, MUTED, ORANGE, RED, example, panels, save_figures
 from make_figures_3 import arrow, box
 from matplotlib.figure import Figure
-from PIL import Image
 
 from odomap import covariances, solve
-from odomap.views.style import PALETTE, dress, figure_png, new_figure
+from odomap.views.style import PALETTE, dress, new_figure
 
 
 def loop_steps() -> Figure:
@@ -91,14 +89,5 @@ def exercise_5() -> Figure:
 FIGURES: tuple[Callable[[], Figure], ...] = (loop_steps, scale_drift, surer, exercise_5)
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for make in FIGURES:
-        if not names or make.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(make(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{make.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

@@ -3,17 +3,15 @@
 All of them come from simulated worlds and from the examples, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, ORANGE, RED, example
+from make_figures import BLUE, GREEN, GREY, INK, ORANGE, RED, example, save_figures
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon
-from PIL import Image
 from scipy.ndimage import maximum_filter
 
 import odomap
@@ -21,7 +19,7 @@ from odomap.geometry.lie import se2_inverse, se2_log
 from odomap.geometry.planar import to_plane, transform_planar
 from odomap.lidar.grid import beside
 from odomap.lidar.scans import Beams
-from odomap.views.style import PALETTE, dress, figure_png, new_figure
+from odomap.views.style import PALETTE, dress, new_figure
 
 Array = np.ndarray
 LIGHT = PALETTE["band"]
@@ -363,14 +361,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )  # fmt: skip
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for make in FIGURES:
-        if not names or make.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(make(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{make.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

@@ -3,17 +3,15 @@
 All of them come from simulated worlds and from the examples, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, ORANGE, RED, example, panels
+from make_figures import BLUE, GREEN, GREY, INK, ORANGE, RED, example, panels, save_figures
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from PIL import Image
 
 import odomap
 from odomap.geometry.lie import se3_inverse
@@ -25,7 +23,7 @@ from odomap.lidar.rangeimage import find_clusters, find_ground, range_image
 from odomap.lidar.scanlines import scan_lines
 from odomap.lidar.sweeps import points_of
 from odomap.maps.cloudmap import cloud_of_map
-from odomap.views.style import dress, figure_png, new_figure
+from odomap.views.style import dress, new_figure
 
 Array = np.ndarray
 
@@ -279,14 +277,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )  # fmt: skip
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for make in FIGURES:
-        if not names or make.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(make(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{make.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])

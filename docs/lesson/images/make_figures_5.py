@@ -3,20 +3,18 @@
 All of them come from the examples and from blocks of the chapter, so that anyone gets the same.
 """
 
-import io
 import sys
 from collections.abc import Callable
 
 import numpy as np
-from make_figures import BLUE, GREEN, GREY, HERE, INK, MUTED, ORANGE, RED, example, panels
+from make_figures import BLUE, GREEN, GREY, INK, MUTED, ORANGE, RED, example, panels, save_figures
 from matplotlib.figure import Figure
-from PIL import Image
 
 from odomap import Loss, PoseGraph, Trajectory, ate, solve
 from odomap.backend.graphs.initialization import spanning_tree
 from odomap.backend.sparse.blocks import BlockPattern
 from odomap.geometry.lie import se2_exp
-from odomap.views.style import PALETTE, dress, figure_png, new_figure
+from odomap.views.style import PALETTE, dress, new_figure
 
 
 def spread_drift() -> Figure:
@@ -216,14 +214,5 @@ FIGURES: tuple[Callable[[], Figure], ...] = (
 )  # fmt: skip
 
 
-def main(names: list[str]) -> None:
-    """Draw all figures, or those named."""
-    for draw in FIGURES:
-        if not names or draw.__name__ in names:
-            picture = Image.open(io.BytesIO(figure_png(draw(), 110))).convert("RGB")
-            small = picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-            small.save(HERE / f"{draw.__name__}.png", optimize=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    save_figures(FIGURES, sys.argv[1:])
