@@ -27,7 +27,6 @@ Exit code 1 where a bar is missed, 2 where recordings are.
 """
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -38,7 +37,7 @@ from pathlib import Path
 import laser2d_runs as runs
 import numpy as np
 import peer
-from meter import machine
+from bars import Bench
 
 from odomap.lidar.grid import OccupancyGrid
 from odomap.lidar.scans import Beams
@@ -57,26 +56,6 @@ WITHOUT_THINNING = (("scan_thinning.enabled", "false"),)
 BUILDING = "sim:building?sensors=laser&seed={}"
 
 
-class Bench:
-    """What was measured, and which bars were missed."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.numbers: dict[str, object] = {}
-        self.missed: list[str] = []
-
-    def need(self, is_kept: bool, sentence: str) -> None:
-        """Note a bar that is missed."""
-        if not is_kept:
-            self.missed.append(sentence)
-
-    def save(self) -> None:
-        """Write what there is."""
-        if self.options.json:
-            content = {"numbers": self.numbers, "missed": self.missed}
-            self.options.json.write_text(json.dumps(content, indent=1), encoding="utf-8")
-
-
 def main() -> int:
     options = _options()
     bench = Bench(options)
@@ -89,14 +68,7 @@ def main() -> int:
         "speed": speed,
         "memory": memory,
     }
-    print(machine())
-    for part in options.part:
-        print(f"\n{part}", flush=True)
-        parts[part](bench)
-        bench.save()
-    for line in bench.missed:
-        print(f"bar missed: {line}")
-    return 1 if bench.missed else 0
+    return bench.measure(parts)
 
 
 def _options() -> argparse.Namespace:

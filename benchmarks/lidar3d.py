@@ -43,11 +43,11 @@ from typing import Any
 import lidar3d_runs as runs
 import numpy as np
 import peer
-from laser2d import Bench, tell_growth
+from bars import Bench
+from laser2d import tell_growth
 from laser2d_runs import rounds_of
 from lidar3d_labels import labelled
 from lidar3d_odometry import Found, Way, followed
-from meter import machine
 
 from odomap.run import chosen_config
 from odomap.simulation.sweepspec import SweepSpec
@@ -83,14 +83,7 @@ def main() -> int:
         "labels": labels,
         "memory": memory,
     }
-    print(machine())
-    for part in options.part:
-        print(f"\n{part}", flush=True)
-        parts[part](bench)
-        bench.save()
-    for line in bench.missed:
-        print(f"bar missed: {line}")
-    return 1 if bench.missed else 0
+    return bench.measure(parts)
 
 
 def _options() -> argparse.Namespace:

@@ -24,7 +24,6 @@ Exit code 1 where a bar is missed. What was refused is listed by --verbose, all 
 """
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Callable
@@ -35,6 +34,7 @@ import cv2
 import loops_live
 import numpy as np
 import peer
+from bars import Bench
 from consistency import simulation_hash
 from loopcases import HEADER, HIDDEN, Case, Forgetful, cells, closing, end_error, play
 from rounds import Rendered
@@ -70,13 +70,8 @@ SMALL: dict[str, dict[str, object]] = {
 """Images are small and few, so that rendering does not take an hour."""
 
 
-class Bench:
-    """What was measured, and which bars were missed."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.numbers: dict[str, object] = {}
-        self.missed: list[str] = []
+class LoopBench(Bench):
+    """What was measured of loops, and which bars were missed."""
 
     def note(self, part: str, case: Case) -> None:
         """Print a case and keep its numbers."""
@@ -87,23 +82,12 @@ class Bench:
         self.need(not case.false, f"{part}: {case.name}: {case.false} false loops")
         self.save()
 
-    def need(self, is_kept: bool, sentence: str) -> None:
-        """Note a bar that is missed."""
-        if not is_kept:
-            self.missed.append(sentence)
-
-    def save(self) -> None:
-        """Write what there is, so that a run that is stopped leaves it."""
-        if self.options.json:
-            content = {"numbers": self.numbers, "missed": self.missed}
-            Path(self.options.json).write_text(json.dumps(content, indent=1), encoding="utf-8")
-
 
 def main() -> int:
     options = _options()
     cv2.setNumThreads(1)
-    bench = Bench(options)
-    parts: dict[str, Callable[[Bench], None]] = {
+    bench = LoopBench(options)
+    parts: dict[str, Callable[[LoopBench], None]] = {
         "system": system,
         "closer": closer,
         "circuits": circuits,
@@ -144,7 +128,7 @@ def _options() -> argparse.Namespace:
 # ---- recordings, there and back ----
 
 
-def system(bench: Bench) -> None:
+def system(bench: LoopBench) -> None:
     """Play all that SLAM has to the recordings, and the peer beside it."""
     options = bench.options
     with tempfile.TemporaryDirectory(prefix="odomap-loops-") as scratch:
@@ -181,7 +165,7 @@ def peer_end(path: Trajectory, truth: Trajectory, is_metric: bool) -> tuple[floa
         return np.inf, np.inf
 
 
-def closer(bench: Bench) -> None:
+def closer(bench: LoopBench) -> None:
     """Play the recordings to SLAM that forgets, without a closer and with one."""
     options = bench.options
     for name in options.recordings:
@@ -204,7 +188,7 @@ def closer(bench: Bench) -> None:
 # ---- worlds ----
 
 
-def rendered(bench: Bench, kind: str, seed: int, folder: Path) -> tuple[World, Rendered]:
+def rendered(bench: LoopBench, kind: str, seed: int, folder: Path) -> tuple[World, Rendered]:
     """Return a world gone round once and a bit more, and its frames, rendered or kept."""
     fields = {"kind": kind, "seed": seed, "sensors": ("stereo", "depth")}
     fields |= {} if bench.options.full else SMALL[kind]
@@ -222,7 +206,9 @@ def rendered(bench: Bench, kind: str, seed: int, folder: Path) -> tuple[World, R
     return world, Rendered(kept)
 
 
-def round_and_round(bench: Bench, part: str, kind: str, seed: int, name: str = "stereo") -> Case:
+def round_and_round(
+    bench: LoopBench, part: str, kind: str, seed: int, name: str = "stereo"
+) -> Case:
     """Play a world to SLAM and judge it."""
     with tempfile.TemporaryDirectory(prefix="odomap-loops-") as folder:
         world, frames = rendered(bench, kind, seed, Path(folder))
@@ -234,7 +220,7 @@ def round_and_round(bench: Bench, part: str, kind: str, seed: int, name: str = "
     return case
 
 
-def circuits(bench: Bench) -> None:
+def circuits(bench: LoopBench) -> None:
     """Go round streets and buildings."""
     options = bench.options
     for world in options.worlds:
@@ -257,7 +243,7 @@ def circuits(bench: Bench) -> None:
         bench.need(low <= mean <= high, sentence)
 
 
-def corridor(bench: Bench) -> None:
+def corridor(bench: LoopBench) -> None:
     """Walk along identical doors."""
     options = bench.options
     for seed in range(options.first_seed, options.first_seed + options.seeds):
@@ -266,7 +252,7 @@ def corridor(bench: Bench) -> None:
         bench.need(case.percent < LARGEST_PERCENT, sentence)
 
 
-def same(bench: Bench) -> None:
+def same(bench: LoopBench) -> None:
     """Play a circuit twice, and compare what is left."""
     left = []
     for _ in range(2):
@@ -281,7 +267,7 @@ def same(bench: Bench) -> None:
     bench.need(left[0] == left[1], "same: two runs in lockstep differ")
 
 
-def live(bench: Bench) -> None:
+def live(bench: LoopBench) -> None:
     """Close loops in a large map, and look at what it costs tracking."""
     stalls = loops_live.measured(bench.options.repeats)
     loops_live.show(stalls)
