@@ -56,8 +56,8 @@ STEPS = 20
 STILL = 1e-3, 2e-5
 """A step that is not one, metres and radians."""
 DAMPED = 1e-3
-"""Share of what is seen in the mean that is added in all directions: where next to nothing is seen,
-as of height between upright walls, a step would go anywhere."""
+"""Share of the traces of H, of places and of turns, that is added to their diagonals: where next to
+nothing is seen, as of height between upright walls, a step would go anywhere."""
 NARROW = 9.0
 """k in the end: three standard deviations."""
 NARROWING = 0.25
@@ -209,7 +209,7 @@ def _match_kernel(
 ) -> tuple[int, bool, int]:  # fmt: skip
     """R, t ← where Gauss–Newton ends; total: the sums there. How many on surfaces, still, steps.
 
-    hold (21,) is added to H.
+    hold (21,) is added to H, and DAMPED of its traces.
     """
     H, xi, k, on = np.empty((6, 6)), np.empty(6), max(wide, NARROW), 0
     for step in range(STEPS):
@@ -250,6 +250,7 @@ def _known_kernel(
     """
     on, every = 0, points.shape[0] // ASKED + 1
     for n in range(0, points.shape[0], every):
+        # As in `_sum_kernel`: a kernel of its own for these lines made matching a third slower.
         x = R[0, 0] * points[n, 0] + R[0, 1] * points[n, 1] + R[0, 2] * points[n, 2]
         y = R[1, 0] * points[n, 0] + R[1, 1] * points[n, 1] + R[1, 2] * points[n, 2]
         z = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2]
