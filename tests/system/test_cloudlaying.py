@@ -59,11 +59,11 @@ def yard_drive():
     viewer = CloudViewer(LidarMount("top"), front_end, CONFIG)
     layer, count = CloudLayer(front_end, motion, CONFIG), 0
 
-    def seen(T, places=world):
+    def seen(T, places=world, times=None):
         nonlocal count
         count += 1
         at = (places - T[:3, 3]) @ T[:3, :3] + rng.normal(0, 0.01, places.shape)
-        return viewer.view(Frame(count, count * 10**8, cloud=Sweep(at)))
+        return viewer.view(Frame(count, count * 10**8, cloud=Sweep(at, times)))
 
     T = se3_exp(-8 * STEP)
     front_end.T = T
@@ -82,11 +82,13 @@ def off(laid, T):
     return np.abs(se3_log(se3_inverse(T) @ laid.match.T_map_body))
 
 
-def test_as_usual_nothing_else_is_asked(yard_drive):
+@pytest.mark.parametrize(("times", "rounds"), [(None, 1), (np.zeros(9000), CONFIG.rounds)])
+def test_as_usual_nothing_else_is_asked(yard_drive, times, rounds):
+    """Where no times say how the motion bends a sweep, not even a second round."""
     layer, front_end, T, seen, _ = yard_drive
     front_end.T, front_end.asked = T @ se3_exp(STEP), 0
-    laid = layer.lay(seen(front_end.T), 0.1)
-    assert front_end.asked == CONFIG.rounds
+    laid = layer.lay(seen(front_end.T, times=times), 0.1)
+    assert front_end.asked == rounds
     assert off(laid, front_end.T).max() < 1e-9
 
 

@@ -39,6 +39,7 @@ __all__ = [
     "COARSER",
     "FAR_AWAY",
     "NONE",
+    "NORMAL",
     "OLD",
     "SURFACE",
     "TILT",
@@ -57,8 +58,9 @@ COARSER = 3
 """Size of large voxels in small ones."""
 FAR_AWAY = FURTHEST // 2
 """Where along x large voxels are in the table, in voxels; small ones stay nearer."""
-TILT = 3
-"""Column of a voxel's mean that says how far its normal may be tilted: δ², radians squared."""
+TILT, NORMAL, PLANE = 3, 4, 8
+"""Columns of a voxel's plane after its mean: how far its normal may be tilted, δ², radians squared;
+where the normal begins, |n|² after it; and how many there are, as many as are fetched at once."""
 WHEN, SUMS = 10, 11
 """Column of a voxel's sums that adds up the numbers of its points' sweeps; and how many it has."""
 FEWEST = 6
@@ -73,10 +75,8 @@ FIRST_ROOM = 4096
 
 
 @kernel
-def plane_kernel(
-    v: int, key: int, size: float, sums: Array, sigma2: float, means: Array, normals: Array
-) -> bool:
-    """μ (V, 3) and n (V, 3) of a voxel; whether its points lie in a plane."""
+def plane_kernel(v: int, key: int, size: float, sums: Array, sigma2: float, planes: Array) -> bool:
+    """planes[v] ← μ, δ², n, |n|² of a voxel; whether its points lie in a plane."""
     n = sums[v, 0]
     if n < FEWEST:
         return False
@@ -84,8 +84,8 @@ def plane_kernel(
     if i > FAR_AWAY // 2:
         i, size = i - FAR_AWAY, size * COARSER
     x, y, z = sums[v, 1] / n, sums[v, 2] / n, sums[v, 3] / n
-    means[v, 0], means[v, 1] = x + (i + 0.5) * size, y + (axis_of_key(key, 1) + 0.5) * size
-    means[v, 2] = z + (axis_of_key(key, 2) + 0.5) * size
+    planes[v, 0], planes[v, 1] = x + (i + 0.5) * size, y + (axis_of_key(key, 1) + 0.5) * size
+    planes[v, 2] = z + (axis_of_key(key, 2) + 0.5) * size
     unbiased = n / (n - 1.0)
     a, b = unbiased * (sums[v, 4] / n - x * x), unbiased * (sums[v, 5] / n - x * y)
     c, d = unbiased * (sums[v, 6] / n - x * z), unbiased * (sums[v, 7] / n - y * y)
@@ -97,9 +97,11 @@ def plane_kernel(
     if not square > 0.0:
         return False
     share = 1.0 - least / (THIN * middle)
-    length = np.sqrt(share / ((least + sigma2) * square))
-    normals[v, 0], normals[v, 1], normals[v, 2] = length * x, length * y, length * z
-    means[v, TILT] = least * middle / (n * (middle - least) ** 2)
+    length2 = share / (least + sigma2)
+    length = np.sqrt(length2 / square)
+    planes[v, NORMAL], planes[v, NORMAL + 1] = length * x, length * y
+    planes[v, NORMAL + 2], planes[v, NORMAL + 3] = length * z, length2
+    planes[v, TILT] = least * middle / (n * (middle - least) ** 2)
     return True
 
 
@@ -172,7 +174,7 @@ class PlaneMap:
         sigma: least thickness of a surface, metres.
 
     Attributes:
-        table, keys, sums, flags, means, normals: arrays of the voxels, for kernels; the first
+        table, keys, sums, flags, planes: arrays of the voxels, for kernels; the first
             `len` rows count.
         sweeps: how many were added.
     """
@@ -192,7 +194,7 @@ class PlaneMap:
     def _make(self, room: int) -> None:
         self.table, self.keys = new_table(room), np.empty(room, np.int64)
         self.sums, self.flags = np.empty((room, SUMS)), np.zeros(room, np.int8)
-        self.means, self.normals = np.empty((room, 4)), np.empty((room, 3))
+        self.planes = np.empty((room, PLANE))
 
     def insert(self, points: Array) -> None:
         """Add points (N, 3) in the map's frame; those too far from its origin are left out."""
@@ -220,7 +222,7 @@ class PlaneMap:
 
     def _keep(self, rows: Index, room: int) -> None:
         """Keep some voxels, in their order, with room for others."""
-        names = "keys", "sums", "flags", "means", "normals"
+        names = "keys", "sums", "flags", "planes"
         old = [getattr(self, name)[rows] for name in names]
         self._make(room)
         for name, kept in zip(names, old, strict=True):
@@ -233,5 +235,5 @@ def warm_up() -> None:
     """Compile the kernels of this file."""
     surfaces = PlaneMap(1.0, 0.05)
     surfaces.insert(np.array([[x, y, 0.01 * x * y] for x in range(3) for y in range(3)]) / 3.0)
-    plane_kernel(0, surfaces.keys[0], 1.0, surfaces.sums, 0.01, surfaces.means, surfaces.normals)
+    plane_kernel(0, surfaces.keys[0], 1.0, surfaces.sums, 0.01, surfaces.planes)
     surfaces.evict(np.zeros(3), 0.1)

@@ -107,16 +107,27 @@ class CloudLayer:
         """Lay a sweep down where it should be, and look elsewhere if that is strange."""
         motion, wrong = self._motion, ""
         guess = motion.predicted(seconds), motion.twist
-        laid = self._lay(self._front_end, view.prepared, *guess, seconds)
+        laid = self._lay(self._front_end, view.prepared, guess, seconds, self._rounds(view))
         if self._seen and seconds > 0.0 and motion.is_strange(laid.match, seconds):
             laid, wrong = self._look_around(view, laid, seconds)
         return replace(laid, wrong=wrong or self._wrong(laid.match, seconds))
 
+    def _rounds(self, view: CloudView) -> int:
+        """Return how often a sweep is laid down: once if no times say what a motion does to it."""
+        has_times = view.points is not None and view.points.has_times
+        return self._config.rounds if has_times else 1
+
     def _lay(
-        self, front_end: FrontEnd[Any], prepared: Any, T: Array, twist: Array, seconds: float
+        self,
+        front_end: FrontEnd[Any],
+        prepared: Any,
+        guess: tuple[Array, Array],
+        seconds: float,
+        rounds: int,
     ) -> Laid:
         """Lay a sweep down from a guess, and again with the motion that this gives."""
-        for n in range(self._config.rounds):
+        T, twist = guess
+        for n in range(rounds):
             match = front_end.match(prepared, T, twist, again=n > 0)
             T = match.T_map_body
             twist = self._motion.twist_to(T, seconds)
@@ -124,7 +135,7 @@ class CloudLayer:
 
     def _look_around(self, view: CloudView, laid: Laid, seconds: float) -> tuple[Laid, str]:
         """Look where a sweep lies on the one before; where it is then, and why it is nowhere."""
-        before, motion = self._seen[-1], self._motion
+        before, motion, rounds = self._seen[-1], self._motion, self._rounds(view)
         front_end, prepared = _looking(before, view)
         guesses = [(laid.match.T_map_body, laid.twist)]
         there = front_end.lying(prepared, *guesses[0])
@@ -134,14 +145,14 @@ class CloudLayer:
         found = []
         for T, twist in guesses:
             front_end.expect_anything()
-            found.append(self._lay(front_end, prepared, T, twist, seconds))
+            found.append(self._lay(front_end, prepared, (T, twist), seconds, rounds))
         best, left = _best(there, found)
         if motion.is_poor(laid.match) and (wrong := self._fits_nowhere(found)):
             return laid, wrong
         if left > CLEARLY or not is_fixed(best.match) or _is_near(best.match, laid.match):
             return laid, ""
         at = best.match.T_map_body, best.twist
-        again = self._lay(self._front_end, view.prepared, *at, seconds)
+        again = self._lay(self._front_end, view.prepared, at, seconds, rounds)
         if not is_fixed(again.match) and left > SURELY:  # the map says that any place is as good
             return laid, ""
         if is_fixed(again.match) and _is_near(again.match, best.match):
