@@ -7,7 +7,8 @@
     kitti     KITTI's raw sweeps: ATE and mean error over 10 m, and ms of a sweep, ours on one
               thread, KISS-ICP on its own (voxels of 1 m, 100 m), the median of --repeats; beside
               it processor time, which other programs change less. Bars: `points` at most KISS-ICP's
-              errors, `loam` and `lego` 1.5 times as much; a third of the time.
+              errors, `loam` and `lego` 1.5 times as much; a third of its time for the same, with
+              motion taken out or not.
     drift     a street gone round once and a bit more, 64 beams, of several seeds, loops not closed:
               error of rotation per metre and drift over segments of 100 m. Bar: mean rotation of
               `points` at most KISS-ICP's.
@@ -15,9 +16,10 @@
               last three sweeps alone: how far the end is from the way there, at the same instant of
               the recording, and from where GPS says, which is good to 5 cm itself. Bars: a loop is
               closed, the end is 5 times nearer to the way there than without or within 5 cm.
-    deskew    how thick surfaces of the map are, with and without deskewing, in KITTI's sweeps and
-              in streets: all, and those across the way; and the motion over a sweep. Bars: thinner;
-              in streets, whose truth is exact, motion within 0.5 %.
+    deskew    how thick planes of the map are, with and without deskewing, in KITTI's sweeps and in
+              streets: all, and those across the way; and the motion over a sweep. A plane is what
+              each sweep alone shows to be one. Bars: thinner; in streets, whose truth is exact,
+              motion within 0.5 %.
     circuits  streets gone round once and a bit more, of several seeds. Bars: ATE 0.3 % of the path,
               a loop closed in each, no sweep lost, the mean normalised error squared per degree of
               freedom from 0.5 to 2 over the seeds.
@@ -36,7 +38,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -131,30 +133,37 @@ def kitti(bench: Bench) -> None:
             source, list(told), bench.options.peer_python, is_recorded=True
         ).items():
             told[way].append(found)
-    print(f"{'':32}{'ATE m':>8}{'10 m: m':>9}{'deg':>8}{'lost':>6}{'ms':>8}{'95 %':>8}{'CPU':>8}")
+    head = f"{'':32}{'ATE m':>8}{'10 m: m':>9}{'deg':>8}{'lost':>6}{'ms':>8}{'95 %':>8}{'CPU':>8}"
+    print(f"{head}{'KISS-ICP = 1':>14}")
     middle = {way: over(found, np.median) for way, found in told.items()}
     for way, f in middle.items():
         print(
             f"{way!s:32}{f.ate_m:8.4f}{f.per10_m:9.4f}{f.per10_deg:8.4f}{f.lost:6.0f}{f.ms:8.1f}"
-            f"{f.ms_p95:8.1f}{f.cpu_ms:8.1f}",
+            f"{f.ms_p95:8.1f}{f.cpu_ms:8.1f}{f.ms / middle[alike(way)].ms:14.2f}",
             flush=True,
         )
     bench.numbers["kitti"] = {str(w): [asdict(f) for f in found] for w, found in told.items()}
     best = over([middle[way] for way in KISS], np.min)
     for way, found in middle.items():
-        if way.is_ours and way.is_compensated:
-            below_kiss(bench, way.who, found, best)
+        if way.is_ours:
+            below_kiss(bench, way, found, replace(best, ms=middle[alike(way)].ms))
 
 
-def below_kiss(bench: Bench, who: str, found: Found, best: Found) -> None:
-    """Hold a front-end against KISS-ICP on KITTI's sweeps."""
+def alike(way: Way) -> Way:
+    """Return what KISS-ICP does to sweeps as a way of ours does, which takes it time, too."""
+    return replace(way, who="KISS-ICP")
+
+
+def below_kiss(bench: Bench, way: Way, found: Found, best: Found) -> None:
+    """Hold a front-end against KISS-ICP on KITTI's sweeps: errors against its least."""
+    who = way.who
     for name, unit in (("ate_m", "m of ATE"), ("per10_m", "m over 10 m")):
         ours, theirs = getattr(found, name), getattr(best, name)
         sentence = f"kitti: {who}: {ours:.4f} {unit}, KISS-ICP {theirs:.4f}"
         bench.need(ours <= LARGEST[who] * theirs, sentence)
     bench.need(found.lost == 0, f"kitti: {who}: {found.lost} sweeps lost")
     ratio = found.ms / best.ms
-    bench.need(ratio <= LARGEST_TIME, f"kitti: {who}: {ratio:.2f} of KISS-ICP's time, at most 1/3")
+    bench.need(ratio <= LARGEST_TIME, f"kitti: {way}: {ratio:.2f} of KISS-ICP's time, at most 1/3")
 
 
 def over(found: list[Found], of: Callable[..., Any]) -> Found:
@@ -217,7 +226,7 @@ def deskew(bench: Bench) -> None:
     for seed in seeds(bench):
         names[f"street {seed}"] = STREET.format(seed, 64, "rotating") + f"&frames={DRIVEN}&speed=12"
     numbers = {}
-    print("surfaces, mm        all   without    across   without  motion %  length %")
+    print("planes, mm          all   without    across   without  motion %  length %")
     for name, data in names.items():
         got = runs.deskewed(data)
         print(
@@ -227,8 +236,8 @@ def deskew(bench: Bench) -> None:
         )
         numbers[name] = asdict(got)
         for kind, thick, without in (
-            ("surfaces", got.with_mm, got.without_mm),
-            ("surfaces across the way", got.across_with_mm, got.across_without_mm),
+            ("planes", got.with_mm, got.without_mm),
+            ("planes across the way", got.across_with_mm, got.across_without_mm),
         ):
             sentence = f"deskew: {name}: {kind} {thick:.1f} mm thick, {without:.1f} without"
             bench.need(thick < without, sentence)

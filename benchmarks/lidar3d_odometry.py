@@ -34,6 +34,7 @@ SKIPPED = 2
 """Sweeps before there is anything to lay one onto are not timed."""
 
 Array = NDArray[np.float64]
+Settings = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -158,9 +159,9 @@ def without_times(frame: Frame) -> Frame:
     return replace(frame, cloud=None if frame.cloud is None else replace(frame.cloud, times=None))
 
 
-def config_of(front_end: str, closes: bool = True) -> Config:
-    """Return the preset with a front-end, and with or without loops."""
-    chosen = (("cloud_tracking.front_end", front_end),)
+def config_of(front_end: str, closes: bool = True, also: Settings = ()) -> Config:
+    """Return the preset with a front-end, with or without loops, and with what else is set."""
+    chosen = (("cloud_tracking.front_end", front_end), *also)
     return chosen_config("lidar", overrides=chosen if closes else chosen + WITHOUT_LOOPS)
 
 

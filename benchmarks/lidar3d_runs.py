@@ -29,9 +29,13 @@ Array = NDArray[np.float64]
 
 REMEMBERED = 3
 """Sweeps that odometry knows of where the older map is hidden from it."""
-CELL_M, FEWEST, WIDE_MM, THIN_MM = 1.0, 20, 200.0, 300.0
-"""Cells in which surfaces are looked at, points and breadth that make one, and how thick it may
-be."""
+CELL_M, FEWEST, WIDE_M, THIN_M = 1.0, 12, 0.15, 0.04
+"""Cells in which planes are looked for; how many points make one, how wide they lie, and how far
+off it at most, standard deviations of a single sweep."""
+ALIKE = 0.95
+"""How much of what sweeps say of a plane's normal must be the same."""
+DENSELY = (("cloud_tracking.keyframe_voxel", "0.1"), ("cloud_tracking.keyframe_m", "1.0"))
+"""Keyframes that keep so many points that each shows planes by itself."""
 ACROSS = np.cos(np.radians(45.0))
 """From which on the normal of a surface points along the way."""
 
@@ -136,9 +140,9 @@ class Deskewed:
     """What deskewing does to a map.
 
     Attributes:
-        with_mm: median standard deviation of what is kept of surfaces, across them.
+        with_mm: how thick planes of the map are, median standard deviation.
         without_mm: the same of sweeps that were taken as if of one instant.
-        across_with_mm: the same of surfaces across the way, along which sweeps are stretched.
+        across_with_mm: the same of planes across the way, along which sweeps are stretched.
         across_without_mm: likewise.
         motion_percent: median error of the motion over a sweep, of its length.
         length_percent: error of the length of the path, of that.
@@ -157,7 +161,7 @@ def deskewed(name: str | Path) -> Deskewed:
     source = open_source(name)
     assert source.truth is not None, f"{source.name}: has no truth"
     runs = [
-        played(each, Slam(each.rig, config_of("points", False)))
+        played(each, Slam(each.rig, config_of("points", False, DENSELY)))
         for each in (source, Changed(source, "without times", without_times))
     ]
     (all_, across), (all_without, across_without) = (thickness(run.result.map) for run in runs)
@@ -166,30 +170,50 @@ def deskewed(name: str | Path) -> Deskewed:
 
 
 def thickness(map: Map) -> tuple[float, float]:
-    """Return the median standard deviation across surfaces of the clouds of all keyframes, mm.
+    """Return how thick planes are in the map, standard deviations, medians, mm.
+
+    A plane is what in a cell is one in each of two sweeps or more, looked at alone: that does not
+    depend on how they lie to each other. In the map it is as thick as all of them together.
 
     Returns:
-        Of all surfaces, and of those that face the way on which they were seen.
+        Of all planes, and of those that face the way on which they were seen.
     """
-    clouds, ways = [], []
-    for k in map.keyframe_ids.tolist():
-        cloud, T = map.keyframe(k).cloud, map.T_world_body(k)
-        if cloud is not None:
-            clouds.append(cloud[:, :3] @ T[:3, :3].T + T[:3, 3])
-            ways.append(np.broadcast_to(T[:3, 0], clouds[-1].shape))
-    points = np.concatenate(clouds)
-    cells = np.floor(points / CELL_M).astype(np.int64)
-    _, of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    keyframes = [(map.keyframe(k).cloud, map.T_world_body(k)) for k in map.keyframe_ids.tolist()]
+    planes = [_planes(cloud, T) for cloud, T in keyframes if cloud is not None]
+    cells, counts, means, spreads, ways = (np.concatenate(row) for row in zip(*planes, strict=True))
+    _, of = np.unique(cells, axis=0, return_inverse=True)
     of = of.ravel()
-    off = points - _sums(of, points)[of] / counts[of, None]
-    spread = _sums(of, (off[:, :, None] * off[:, None]).reshape(-1, 9)) / counts[:, None]
-    ahead = _sums(of, np.concatenate(ways)) / counts[:, None]
-    is_many = counts >= FEWEST
-    squares, axes = np.linalg.eigh(spread[is_many].reshape(-1, 3, 3))
-    thin, wide, _ = 1e3 * np.sqrt(np.maximum(squares, 0.0)).T
-    is_surface = (wide > WIDE_MM) & (thin < THIN_MM)
-    is_across = np.abs(np.einsum("ni,ni->n", axes[:, :, 0], ahead[is_many])) > ACROSS
-    return float(np.median(thin[is_surface])), float(np.median(thin[is_surface & is_across]))
+    every = np.bincount(of, counts)
+    off = means - (_sums(of, counts[:, None] * means) / every[:, None])[of]
+    together = spreads + off[:, :, None] * off[:, None]
+    together = _sums(of, (counts[:, None, None] * together).reshape(-1, 9)) / every[:, None]
+    n = np.linalg.eigh(spreads)[1][:, :, 0]
+    normals = _sums(of, (n[:, :, None] * n[:, None]).reshape(-1, 9)) / np.bincount(of)[:, None]
+    shares, axes = np.linalg.eigh(normals.reshape(-1, 3, 3))
+    n = axes[:, :, 2]
+    thick = 1e3 * np.sqrt(np.einsum("ni,nij,nj->n", n, together.reshape(-1, 3, 3), n))
+    is_plane = (np.bincount(of) >= 2) & (shares[:, 2] > ALIKE)
+    ahead = _sums(of, ways) / np.bincount(of)[:, None]
+    is_across = is_plane & (np.abs(np.einsum("ni,ni->n", n, ahead)) > ACROSS)
+    return float(np.median(thick[is_plane])), float(np.median(thick[is_across]))
+
+
+def _planes(
+    cloud: NDArray[np.float32], T: Array
+) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
+    """Return the planes of a sweep: cells, numbers of points, means, spreads, and the way ahead."""
+    points = cloud[:, :3] @ T[:3, :3].T + T[:3, 3]
+    cells = np.floor(points / CELL_M).astype(np.int64)
+    cells, of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    of = of.ravel()
+    means = _sums(of, points) / counts[:, None]
+    off = points - means[of]
+    spreads = _sums(of, (off[:, :, None] * off[:, None]).reshape(-1, 9)) / counts[:, None]
+    spreads = spreads.reshape(-1, 3, 3)
+    thin, wide, _ = np.linalg.eigvalsh(spreads).T
+    kept = (counts >= FEWEST) & (thin < THIN_M**2) & (wide > WIDE_M**2)
+    ways = np.broadcast_to(T[:3, 0], (int(kept.sum()), 3))
+    return cells[kept], counts[kept].astype(float), means[kept], spreads[kept], ways
 
 
 def _sums(of: NDArray[np.int64], rows: Array) -> Array:
