@@ -87,8 +87,8 @@ def features_of(
     all_marks, all_ground = np.empty_like(marks), np.empty_like(ground)
     all_marks[lines.order], all_ground[lines.order] = marks, ground
     return FeatureSweep(
-        sweep.points[order], sweep.times[order], kinds.astype(np.uint8), sweep.points[flat],
-        sweep.times[flat], all_marks, all_ground,
+        sweep.points.take(order, axis=0), sweep.times[order], kinds.astype(np.uint8),
+        sweep.points.take(flat, axis=0), sweep.times[flat], all_marks, all_ground,
     )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ class PlaneFrontEnd:
             self._voxel = suitable_voxel(sweep.points, config)
         voxel = self._voxel or 1.0
         rows = first_in_voxels(sweep.points, config.added * voxel)
-        points, times = sweep.points[rows], sweep.times[rows]
+        points, times = sweep.points.take(rows, axis=0), sweep.times[rows]
         return ThinSweep(points, times, first_in_voxels(points, config.matched * voxel))
 
     def match(
@@ -70,7 +70,7 @@ class PlaneFrontEnd:
     ) -> SweepMatch:
         """Find where a sweep was taken; see `frontend`."""
         rows = prepared.matched
-        points = deskew(prepared.points[rows], prepared.times[rows], twist)
+        points = deskew(prepared.points.take(rows, axis=0), prepared.times[rows], twist)
         if self._map is None or len(points) == 0:
             return SweepMatch(T_map_body, np.zeros((6, 6)), 0, len(points), 0.0, False, "no map")
         surfaces, config = self._map, self._config
@@ -90,7 +90,7 @@ class PlaneFrontEnd:
     def lying(self, prepared: ThinSweep, T_map_body: Array, twist: Array) -> SweepMatch:
         """Say how a sweep lies where it is, and find nothing; arguments as those of `match`."""
         rows = prepared.matched
-        points = deskew(prepared.points[rows], prepared.times[rows], twist)
+        points = deskew(prepared.points.take(rows, axis=0), prepared.times[rows], twist)
         surfaces = self._surfaces()
         on, mean = lying(surfaces, points, T_map_body)
         error = surfaces.sigma * float(np.sqrt(mean))

@@ -83,13 +83,12 @@ def range_image(lines: ScanLines, R_body_lidar: Array) -> RangeImage:
         R_body_lidar: (3, 3) how the LiDAR is turned.
     """
     p = lines.points
-    flat = np.hypot(p[:, 0], p[:, 1])
     azimuth = np.arctan2(p[:, 1], p[:, 0])
     if lines.turns:
         step, rows = lines.step, len(lines)
         row = np.repeat(np.arange(rows), np.diff(lines.start))
     else:
-        elevation = np.arctan2(p[:, 2], flat)
+        elevation = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
         low, high = (float(elevation.min()), float(elevation.max())) if len(p) else (0.0, 0.0)
         width = float(np.ptp(azimuth)) if len(p) else 0.0
         step = LOOSE * np.sqrt(max((high - low) * width, 1e-6) / max(len(p), 1))

@@ -80,7 +80,7 @@ def scan_lines(sweep: SweepPoints, T_body_lidar: Array) -> ScanLines:
         order = np.lexsort((azimuths(points), beams))
     elif not turns and sweep.has_times and np.any(np.diff(sweep.times[order]) < 0):
         order = np.lexsort((sweep.times, beams))
-    ordered = points[order]
+    ordered = points.take(order, axis=0)  # far faster than points[order]
     return ScanLines(ordered, order, start, turns, _median_step(ordered, start))
 
 

@@ -149,7 +149,7 @@ class CloudViewer:
         points = view.points
         assert points is not None
         rows = first_in_voxels(points.points, self._config.keyframe_voxel)
-        moved = deskew(points.points[rows], points.times[rows] + view.middle, twist)
+        moved = deskew(points.points.take(rows, axis=0), points.times[rows] + view.middle, twist)
         T = self._T_lidar_body
         kept = np.empty((len(rows), 4), np.float32)
         kept[:, :3] = moved @ T[:3, :3].T + T[:3, 3]
