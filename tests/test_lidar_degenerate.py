@@ -9,13 +9,21 @@ from odomap.geometry.lie import se3_inverse, se3_log
 from odomap.lidar.deskew import deskew
 from odomap.maps.estimate import Status
 from odomap.sources.wrappers import Changed
-from sweepruns import Kept, judge, played, sigmas
+from sweepruns import Kept, judge, played, sigmas, tracked
+
+SOLID = "16&pattern=solid_state"
 
 
-@pytest.mark.parametrize(("seed", "beams", "speed"), [(0, 16, 7.5), (1, 32, 15), (4, 16, 3)])
-def test_along_a_tunnel_nothing_is_known_if_it_was_not_known_before(seed, beams, speed):
-    source = Kept("tunnel", beams, 60, seed, more=f"&speed={speed}")
-    estimates, *_ = played(source, source.rig)
+@pytest.mark.parametrize(
+    ("front_end", "seed", "beams", "speed"),
+    [
+        ("points", 0, 16, 7.5), ("points", 1, 32, 15), ("points", 4, 16, 3), ("loam", 6, 16, 7.5),
+        ("lego", 7, 16, 10), ("lego", 8, SOLID, 7.5), ("loam", 9, 64, 5),
+    ],
+)  # fmt: skip
+def test_along_a_tunnel_nothing_is_known_if_it_was_not_known_before(front_end, seed, beams, speed):
+    source = Kept("tunnel", beams, 50, seed, more=f"&speed={speed}")
+    estimates, _ = tracked(source, source.rig, front_end)
     off = judge(estimates, source.truth.Ts_world_body)
     assert all(e.status is Status.TRACKING for e in estimates)
     told = ["do not fix translation along (1.00, " in e.reason for e in estimates[1:]]
@@ -24,6 +32,15 @@ def test_along_a_tunnel_nothing_is_known_if_it_was_not_known_before(seed, beams,
     assert (sigma[5:, 0] > 20.0 * sigma[5:, 1]).all()
     assert (off[5:, 0] ** 2 / sigma[5:, 0] ** 2).mean() < 4.0
     assert np.abs(off[:, 3:]).max() < 0.03
+
+
+@pytest.mark.parametrize(("seed", "front_end"), [(5, "loam"), (6, "lego")])
+def test_few_points_of_a_solid_state_lidar_fix_a_street(seed, front_end):
+    source = Kept("street", SOLID, 40, seed)
+    estimates, _ = tracked(source, source.rig, front_end)
+    off = judge(estimates, source.truth.Ts_world_body)
+    assert all(e.status is Status.TRACKING and not e.reason for e in estimates[4:])
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 0.15
 
 
 def with_pillars(source, last):

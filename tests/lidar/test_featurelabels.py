@@ -178,7 +178,7 @@ def test_a_lidar_that_is_mounted_askew_sees_the_same(make):
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_hardly_any_points_have_hardly_any_features(make, count):
     found = make().prepare(points(np.random.default_rng(0).normal(5.0, 1.0, (count, 3))))
-    assert len(found.points) == np.count_nonzero(found.marks >= PLANE)
+    assert np.count_nonzero(found.marks >= PLANE) <= len(found.points) <= count
     assert len(found.marks) == count
 
 

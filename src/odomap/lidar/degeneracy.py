@@ -30,7 +30,7 @@ from odomap.geometry.so3 import hat
 from odomap.kernels import kernel
 from odomap.lidar.icp import SLOTS, add_plane
 
-__all__ = ["Certainty", "judge", "known_part", "named", "warm_up"]
+__all__ = ["Certainty", "holding", "judge", "known_part", "named", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,10 @@ GROSS = 9.0
 MEDIAN_OF_CHI2 = 0.4549
 EXACT = 1e-9
 """Least σ, as a share of the cloud's radius: exact clouds have no noise to scale with."""
+HELD = 1e4
+"""β, where a motion is seen by 1 at most."""
+LEVER = 2.0
+"""Metres that a body is moved as easily as it is turned by a radian."""
 PLANE = (0, 1, 5)
 """What is free in the plane: x, y, θ."""
 
@@ -64,8 +68,9 @@ class Certainty:
 
 
 def judge(
-    p: Array, e: Array, n: Array, spreads: Array, own: Array, R: Array, origin: Array, planar: bool
-) -> Certainty:
+    p: Array, e: Array, n: Array, spreads: Array, own: Array, R: Array, origin: Array,
+    planar: bool, least: float = LEAST_SHARE,
+) -> Certainty:  # fmt: skip
     """Say how well pairs fix a motion.
 
     Args:
@@ -77,6 +82,7 @@ def judge(
         R: (3, 3) source to target.
         origin: (3,) the source's mean: the motion is that of its frame, not of its middle.
         planar: whether x, y and θ alone are free.
+        least: share of a motion that must be seen.
     """
     free = np.array(PLANE) if planar else np.arange(6)
     squares, sums = np.empty(len(p)), np.zeros((4, SLOTS))
@@ -91,7 +97,7 @@ def judge(
     motion = _motion(sums[2]) + known * 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
     fits = _symmetric(sums[0]) - noise
     noise, motion, fits = (M[np.ix_(free, free)] / known for M in (noise, motion, fits))
-    root, weak = known_part(fits, noise, motion)
+    root, weak = known_part(fits, noise, motion, least)
     shift = np.eye(6)
     shift[:3, 3:] = -hat(origin)
     root = shift[np.ix_(free, free)].T @ root
@@ -189,6 +195,18 @@ def _variance(squares: Array, used: int) -> float:
     """Return σ² of squared residuals (N,), a part of which may be gross."""
     kept = squares[squares <= GROSS * float(np.median(squares)) / MEDIAN_OF_CHI2]
     return float(kept.sum() / max(len(kept) - used, 1))
+
+
+def holding(weak: Array, weight: float) -> Array:
+    """Return what (6, 6) is added to H for tangents (K, 6) to be held, with H of so much weight.
+
+    It is β M W (Wᵀ M W)⁻¹ Wᵀ M, M saying how easily a body moves: the rest stays as it is.
+    """
+    if not len(weak):
+        return np.zeros((6, 6))
+    unlikely = weight * np.diag(np.repeat([1.0, LEVER**2], 3))
+    moved = unlikely @ weak.T
+    return np.asarray(HELD * moved @ np.linalg.solve(weak @ moved, moved.T))
 
 
 def _parted(weak: Array, turns: int) -> Array:

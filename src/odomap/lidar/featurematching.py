@@ -6,13 +6,12 @@
     min_T  Σ ρ(r² / s_v²) + Σ ρ(|e|² / s_v²),    s_v² = κ² (λ_thin + σ₀²)
 
 by Gauss-Newton, with ρ after Geman and McClure, and κ from the median of the residuals one step
-before, so that it tightens. Stages hold some directions: LeGO-LOAM finds z, roll and pitch from the
-ground alone, then x, y and yaw from edges, then all from all.
+before, so that it tightens; where no plane is around, that of the large voxel counts. Stages hold
+some directions: LeGO-LOAM finds z, roll and pitch from the ground alone, then x, y and yaw from
+edges, then all from all, from the first guess if that fits better: few edges may lead anywhere.
 
-What is said of the result (`degeneracy`) is not more than the map can know: points on one voxel
-share its error, so that m of them count as m / (1 + m q) with q the share of the variance that they
-have in common, and all share D of what is the same for the whole sweep, such as motion that was not
-constant: (I⁻¹ + D)⁻¹. In directions that nothing fixes the first guess stays, and I is zero.
+What is said of the result (`featurepairs`, `degeneracy`) is not more than the map can know. What
+nothing fixes is held at the first guess in a second go, and of it I is zero.
 
 Cost: 0.2 µs for the shape of a feature, 0.1 µs for each and step.
 
@@ -25,10 +24,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.geometry.lie import se3_exp, se3_log
 from odomap.kernels import kernel
-from odomap.lidar.degeneracy import judge
-from odomap.lidar.featuremap import AXIS, MEAN, SPREAD, VoxelShapes
+from odomap.lidar.degeneracy import Certainty, holding, judge
+from odomap.lidar.featuremap import AXIS, COARSER, FAR_AWAY, MEAN, SPREAD, VoxelShapes
+from odomap.lidar.featurepairs import (
+    ALL,
+    EDGES,
+    GROUND,
+    PLANES,
+    SIGMA,
+    pairs_of,
+    with_common,
+)
 from odomap.lidar.frontend import SweepMatch
 from odomap.lidar.icp import COUNT, SLOTS, add_metric, add_plane, newton_step
 from odomap.lidar.voxels import key_of, slot_of
@@ -39,21 +46,14 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Kinds = NDArray[np.uint8]
 
-EDGES, PLANES, GROUND = 1, 2, 4
-"""Kinds of features, as bits."""
-ALL = EDGES | PLANES | GROUND
 FEWEST = 20
 """Features on the map below which nothing is known."""
 KNOWN = 5
 """One in so many features must lie where something is known."""
-SIGMA = 0.02
-"""Standard deviation of a feature across what it lies on, metres."""
 GROSS = 9.0
 """Squares of this many s² and more are of something else."""
-SHARED = 0.1
-"""Share of the variance that points on one voxel have in common."""
-IN_COMMON = 0.002, 0.0002
-"""Standard deviation of what all points of a sweep are off by together: metres, radians."""
+SEEN = 0.0015
+"""Share of a motion that must be seen beyond chance: tunnels show 0.0009, KITTI's roads 0.003."""
 STILL = 5e-4, 5e-5
 """What a step may be to be the last: metres, radians."""
 SAME = 0.01, 5e-4
@@ -96,121 +96,89 @@ def match_features(
         stages: one after the other.
         common: factor on what all points of a sweep are off by together.
     """
-    R, t = np.ascontiguousarray(T_map_body[:3, :3]), np.ascontiguousarray(T_map_body[:3, 3])
-    R, t = R.copy(), t.copy()
-    rows, squares = np.full(len(points), -1, np.int64), np.zeros(len(points))
     rules = [(s.kinds, s.held, s.reach * planes.voxel, s.iterations) for s in stages]
-    table = np.array(rules, np.float64)
+    seen = points, kinds, np.array(rules, np.float64), planes, edges, T_map_body
+    laid = _lay(*seen, np.zeros((6, 6)))
+    said = laid.said
+    if said is None:
+        nothing = np.zeros((6, 6))
+        reason = f"only {laid.met} of {len(points)} edges and planes lie on what was seen before"
+        return SweepMatch(T_map_body, nothing, laid.met, laid.asked, 0.0, False, reason)
+    if len(said.weak_directions):  # it went where tilts led it
+        held = _lay(*seen, _hold_of(said.weak_directions, laid))
+        if held.said is not None:
+            laid, said = held, max(held.said, said, key=lambda one: len(one.weak_directions))
+    information = with_common(said.information, common)
+    is_still = laid.moved < 1.0
+    return SweepMatch(
+        laid.T_map_body, information, laid.met, laid.asked, said.error, is_still, said.reason
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Features where steps ended.
+
+    Attributes:
+        T_map_body: (4, 4).
+        moved: by the last step, in units of the smallest that counts.
+        met: features that lie on the map. asked: of which that can be said.
+        middle: (3,) of those, in the body; weak directions are about it.
+        said: how well they fix the motion; None where they are too few.
+    """
+
+    T_map_body: Array
+    moved: float
+    met: int
+    asked: int
+    middle: Array
+    said: Certainty | None
+
+
+def _lay(
+    points: Array, kinds: Kinds, rules: Array, planes: VoxelShapes, edges: VoxelShapes,
+    T_map_body: Array, hold: Array,
+) -> _Laid:  # fmt: skip
+    """Lay features onto a map from a first guess; hold (6, 6) is added to H."""
+    T = np.array(T_map_body)
+    R, t = T[:3, :3].copy(), T[:3, 3].copy()
+    rows, squares = np.full(len(points), -1, np.int64), np.zeros(len(points))
     moved = _match(
-        points, kinds, table, planes.table, planes.shapes, planes.voxel, edges.table, edges.shapes,
-        edges.voxel, R, t, rows, squares,
+        points, kinds, rules, planes.table, planes.shapes, planes.voxel, edges.table, edges.shapes,
+        edges.voxel, hold[np.triu_indices(6)], R, t, rows, squares,
     )  # fmt: skip
     on = (rows >= 0) & (squares < GROSS)
     met = int(np.count_nonzero(on))
     # Of a place that was not seen yet nobody can say whether it fits; but some must be known.
     asked = max(int(np.count_nonzero(rows >= 0)), len(points) // KNOWN, 1)
     if met < FEWEST or not moved >= 0.0:
-        reason = f"only {met} of {len(points)} edges and planes lie on what was seen before"
-        return SweepMatch(T_map_body, np.zeros((6, 6)), met, asked, 0.0, False, reason)
-    at = np.flatnonzero(on)
-    p, e, n, spreads, own = _pairs(points[at], kinds[at], rows[at], planes, edges, R, t)
-    middle = p.mean(axis=0)
-    said = judge(p - middle, e, n, spreads, own, R, middle, False)
-    T = np.eye(4)
+        return _Laid(T, moved, met, asked, np.zeros(3), None)
     T[:3, :3], T[:3, 3] = R, t
-    if len(said.weak_directions):
-        T = _kept(T, T_map_body, said.weak_directions, p - middle, middle)
-    information = _with_common(said.information, common)
-    return SweepMatch(T, information, met, asked, said.error, moved < 1.0, said.reason)
+    at = np.flatnonzero(on)
+    p, e, n, spreads, own = pairs_of(points[at], kinds[at], rows[at], planes, edges, R, t)
+    middle = p.mean(axis=0)
+    said = judge(p - middle, e, n, spreads, own, R, middle, False, SEEN)
+    return _Laid(T, moved, met, asked, middle, said)
 
 
-def _with_common(information: Array, common: float) -> Array:
-    """(I⁻¹ + D)⁻¹ = R (1 + Rᵀ D R)⁻¹ Rᵀ of I = R Rᵀ, which need not be regular."""
-    values, axes = np.linalg.eigh(information)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
-    sigma = common * np.repeat(IN_COMMON, 3)[:, None]
-    inner = np.linalg.inv(np.eye(6) + (sigma * root).T @ (sigma * root))
-    return np.asarray(root @ (0.5 * (inner + inner.T)) @ root.T)
+def _hold_of(weak: Array, laid: _Laid) -> Array:
+    """Return what (6, 6) is added to H for directions (K, 6) about the features' middle to be held.
 
-
-def _kept(T: Array, guess: Array, weak: Array, p: Array, middle: Array) -> Array:
-    """Return T with what it says along weak directions as the guess has it.
-
-    Of all that differ from T along these alone, it is the nearest to the guess: ξ - W c with c the
-    least squares of how points move, Wᵀ K W c = Wᵀ K ξ. Tangents are about the features' mean.
+    H is of turns about the body and along the axes of the map.
     """
-    shift = np.eye(4)
-    shift[:3, 3] = middle
-    back = np.linalg.inv(shift)
-    xi = se3_log(back @ np.linalg.inv(guess) @ T @ shift)
-    second = p.T @ p / len(p)
-    K = np.zeros((6, 6))
-    K[:3, :3], K[3:, 3:] = np.eye(3), np.trace(second) * np.eye(3) - second
-    W = weak.T
-    c = np.linalg.lstsq(W.T @ K @ W, W.T @ K @ xi, rcond=None)[0]
-    return np.asarray(guess @ shift @ se3_exp(xi - W @ c) @ back)
-
-
-def _pairs(
-    points: Array, kinds: Kinds, rows: Index, planes: VoxelShapes, edges: VoxelShapes, R: Array,
-    t: Array,
-) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
-    """Return points, where they should be, normals, spreads and own shares for `judge`.
-
-    An edge is two planes across one another that meet in it.
-    """
-    count = len(points) + int(np.count_nonzero(kinds == EDGES))
-    p, e, n = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
-    spreads, own = np.ones((count, 5)), np.empty(count)
-    met = np.zeros((2, max(len(planes.shapes), len(edges.shapes))))
-    _pairs_kernel(
-        points, kinds, rows, planes.shapes, edges.shapes, R, t, met, p, e, n, spreads, own
-    )
-    return p, e, n, spreads, own
-
-
-@kernel
-def _pairs_kernel(
-    points: Array, kinds: Kinds, rows: Index, planes: Array, edges: Array, R: Array, t: Array,
-    met: Array, p: Array, e: Array, n: Array, spreads: Array, own: Array,
-) -> None:  # fmt: skip
-    """Rows of `_pairs`; met: points on each plane, and on each edge."""
-    for i in range(points.shape[0]):
-        met[1 if kinds[i] == EDGES else 0, rows[i]] += 1.0
-    k = 0
-    for i in range(points.shape[0]):
-        is_edge = kinds[i] == EDGES
-        s = edges[rows[i]] if is_edge else planes[rows[i]]
-        m = met[1 if is_edge else 0, rows[i]]
-        ax, ay, az = s[AXIS], s[AXIS + 1], s[AXIS + 2]
-        for side in range(2 if is_edge else 1):
-            for r in range(3):
-                x = R[r, 0] * points[i, 0] + R[r, 1] * points[i, 1] + R[r, 2] * points[i, 2] + t[r]
-                e[k, r], p[k, r] = s[MEAN + r] - x, points[i, r]
-                n[k, r] = s[AXIS + r]
-            if is_edge and side == 0:  # across the edge, and level where it is not upright
-                if abs(az) < 0.9:
-                    ux, uy, uz = -ay, ax, 0.0
-                else:
-                    ux, uy, uz = 0.0, -az, ay
-                size = np.sqrt(ux * ux + uy * uy + uz * uz)
-                n[k, 0], n[k, 1], n[k, 2] = ux / size, uy / size, uz / size
-            elif is_edge:
-                bx, by, bz = n[k - 1, 0], n[k - 1, 1], n[k - 1, 2]
-                n[k, 0], n[k, 1] = ay * bz - az * by, az * bx - ax * bz
-                n[k, 2] = ax * by - ay * bx
-            spreads[k, 0] = s[SPREAD]
-            spreads[k, 1], spreads[k, 2] = s[SPREAD + 1], s[SPREAD + 2]
-            spreads[k, 3] = s[SPREAD + 3]
-            own[k] = SIGMA * SIGMA / (s[SPREAD + 1] + SIGMA * SIGMA) / (1.0 + SHARED * m)
-            k += 1
+    R = laid.T_map_body[:3, :3]
+    moves = weak[:, :3] - np.cross(weak[:, 3:], laid.middle)
+    return holding(np.column_stack([moves @ R.T, weak[:, 3:] @ R.T]), laid.met / SIGMA**2)
 
 
 @kernel
 def _shape_at(
     x: float, y: float, z: float, table: Index, shapes: Array, size: float, reach2: float
 ) -> int:
-    """The shape of the voxel a point is in; else of those around the one with the nearest mean."""
+    """The shape of the voxel a point is in; else of those around the one with the nearest mean.
+
+    Where there is none, that of the large voxel.
+    """
     i, j, k = int(np.floor(x / size)), int(np.floor(y / size)), int(np.floor(z / size))
     v = table[slot_of(key_of(i, j, k), table), 1]
     if v >= 0 and shapes[v, SPREAD] > 0.0:
@@ -236,7 +204,12 @@ def _shape_at(
                 d2 = u * u + w * w + q * q
                 if d2 < best2:
                     best, best2 = int(v), d2
-    return best
+    if best >= 0:
+        return best
+    size *= COARSER
+    i, j, k = int(np.floor(x / size)), int(np.floor(y / size)), int(np.floor(z / size))
+    v = table[slot_of(key_of(i + FAR_AWAY, j, k), table), 1]
+    return int(v) if v >= 0 and shapes[v, SPREAD] > 0.0 else -1
 
 
 @kernel
@@ -323,16 +296,30 @@ def _hold(total: Array, held: int) -> None:
 @kernel
 def _match(
     points: Array, kinds: Kinds, stages: Array, planes_table: Index, planes: Array,
-    planes_size: float, edges_table: Index, edges: Array, edges_size: float, R: Array, t: Array,
-    rows: Index, squares: Array,
+    planes_size: float, edges_table: Index, edges: Array, edges_size: float, hold: Array, R: Array,
+    t: Array, rows: Index, squares: Array,
 ) -> float:  # fmt: skip
     """All steps of all stages; R and t are moved, squares left in units of κ². The last step in
-    units of the smallest that counts, -1 where features are too few."""
+    units of the smallest that counts, -1 where features are too few. hold (21,) is added to H."""
     total, H, xi = np.empty(SLOTS), np.empty((6, 6)), np.empty(6)
     kappa2, moved, sample = WIDE * WIDE, -1.0, np.empty(points.shape[0])
+    R_0, t_0 = R.copy(), t.copy()
     for stage in range(stages.shape[0]):
         wanted, held, reach = int(stages[stage, 0]), int(stages[stage, 1]), stages[stage, 2]
         glanced, is_new = 0 if stage == stages.shape[0] - 1 else GLANCED, True
+        if wanted == ALL and stage > 0 and int(stages[stage - 1, 0]) != ALL:
+            misfit, most = np.zeros(2), GROSS * WIDE * WIDE
+            for at in range(2):
+                R_at, t_at = R if at else R_0, t if at else t_0
+                _meet(
+                    points, kinds, ALL, GLANCED, reach * reach, planes_table, planes, planes_size,
+                    edges_table, edges, edges_size, R_at, t_at, rows,
+                )  # fmt: skip
+                _sum(points, kinds, rows, planes, edges, R_at, t_at, most, squares, total)
+                for i in range(points.shape[0]):
+                    misfit[at] += min(squares[i], most) if rows[i] >= 0 else most
+            if misfit[0] < misfit[1]:
+                R[:], t[:], kappa2 = R_0, t_0, WIDE * WIDE
         for step in range(int(stages[stage, 3])):
             if is_new:
                 _meet(
@@ -349,6 +336,8 @@ def _match(
                     sample[count] = squares[i]
                     count += 1
             kappa2 = max(np.median(sample[:count]) / 0.4549, 1.0)
+            for c in range(hold.shape[0]):
+                total[c] += hold[c]
             _hold(total, held)
             if not newton_step(total, False, R, t, H, xi):
                 moved = -1.0

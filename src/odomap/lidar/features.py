@@ -4,7 +4,9 @@
            →  all at the stamp, by the motion over the sweep  p' = exp(ξ t) p
            →  onto edges and planes of the map                 (`featurematching`)
 
-Few features are matched, many are added to the map: all points of planes serve its planes.
+Few features are matched, many are added to the map: all points of planes serve its planes. Where a
+line's points are so far apart that it says nothing of most of them, as that of a sparse solid-state
+LiDAR, these are taken for planes, too: whether they are, the map's voxels tell.
 
 Where the prediction may be poor, since the map is young or far less fits than did before, the sweep
 is first laid onto the sweep before (`registration`), which finds its way from a metre off, and then
@@ -78,12 +80,28 @@ class FeatureSweep:
 
 
 def features_of(
-    sweep: SweepPoints, lines: ScanLines, marks: Marks, ground: NDArray[np.bool_]
-) -> FeatureSweep:
-    """Return features by the marks and the ground (N,) of points in the order of lines."""
-    rows = np.flatnonzero(marks >= PLANE)
+    sweep: SweepPoints, lines: ScanLines, marks: Marks, ground: NDArray[np.bool_],
+    unknown: NDArray[np.bool_], wanted: int,
+) -> FeatureSweep:  # fmt: skip
+    """Return the features of a sweep.
+
+    Args:
+        sweep: its points.
+        lines: them in order.
+        marks: (N,) of points in the order of lines. ground: (N,) which lie on it.
+        unknown: (N,) of which their line says nothing.
+        wanted: planes that are filled up with those where there are fewer.
+    """
+    is_plane = marks == PLANE
+    loose = np.flatnonzero(unknown & (marks == 0))
+    lacking = wanted - int(np.count_nonzero(is_plane))
+    is_flat = (marks == FLAT) | is_plane
+    if lacking > 0:
+        is_flat[loose] = True
+        is_plane[loose[:: max(-(-len(loose) // lacking), 1)]] = True
+    rows = np.flatnonzero((marks == EDGE) | is_plane)
     kinds = np.where(marks[rows] == EDGE, EDGES, np.where(ground[rows], GROUND, PLANES))
-    order, flat = lines.order[rows], lines.order[(marks == FLAT) | (marks == PLANE)]
+    order, flat = lines.order[rows], lines.order[is_flat]
     all_marks, all_ground = np.empty_like(marks), np.empty_like(ground)
     all_marks[lines.order], all_ground[lines.order] = marks, ground
     return FeatureSweep(
@@ -193,7 +211,8 @@ class LocalFeatures:
         flat = deskew(prepared.flat, prepared.flat_times, twist)
         R, t = T_map_body[:3, :3], T_map_body[:3, 3]
         self.edges.insert(edges @ R.T + t)
-        self.planes.insert(flat @ R.T + t)
+        some = deskew(prepared.points[~is_edge], prepared.times[~is_edge], twist)
+        self.planes.insert(flat @ R.T + t, some @ R.T + t)
         return np.concatenate([edges, flat])
 
 

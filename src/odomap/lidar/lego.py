@@ -18,7 +18,7 @@ mapping on variable terrain", IROS 2018.
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.lidar.curvature import curvatures
+from odomap.lidar.curvature import CUT, curvatures
 from odomap.lidar.featureconfig import LegoConfig
 from odomap.lidar.featurematching import EDGES, GROUND, FeatureStage
 from odomap.lidar.featurepicking import pick
@@ -66,7 +66,8 @@ class LegoFrontEnd:
         may = np.where(is_thing, 3, np.where(is_ground, 1, 0)).astype(np.uint8)
         c, reach = curvatures(lines, config.curvature)
         marks = pick(lines, c, reach, may, config.curvature)
-        return features_of(sweep, lines, marks, is_ground)
+        unknown = (c == CUT) & (may > 0)
+        return features_of(sweep, lines, marks, is_ground, unknown, config.curvature.least_planes)
 
     def match(
         self, prepared: FeatureSweep, T_map_body: Array, twist: Array, again: bool = False

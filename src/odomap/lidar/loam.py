@@ -17,7 +17,7 @@ Reference: J. Zhang, S. Singh, "LOAM: lidar odometry and mapping in real-time", 
 import numpy as np
 from numpy.typing import NDArray
 
-from odomap.lidar.curvature import curvatures
+from odomap.lidar.curvature import CUT, curvatures
 from odomap.lidar.featureconfig import LoamConfig
 from odomap.lidar.featurematching import FeatureStage
 from odomap.lidar.featurepicking import pick
@@ -50,10 +50,11 @@ class LoamFrontEnd:
     def prepare(self, sweep: SweepPoints) -> FeatureSweep:
         """Find edges and planes."""
         lines = scan_lines(sweep, self._T_body_lidar)
-        c, reach = curvatures(lines, self._config.curvature)
-        may = np.full(len(c), 3, np.uint8)
-        marks = pick(lines, c, reach, may, self._config.curvature)
-        return features_of(sweep, lines, marks, np.zeros(len(c), np.bool_))
+        rules = self._config.curvature
+        c, reach = curvatures(lines, rules)
+        marks = pick(lines, c, reach, np.full(len(c), 3, np.uint8), rules)
+        ground = np.zeros(len(c), np.bool_)
+        return features_of(sweep, lines, marks, ground, c == CUT, rules.least_planes)
 
     def match(
         self, prepared: FeatureSweep, T_map_body: Array, twist: Array, again: bool = False

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.degeneracy import known_part
+from odomap.lidar.degeneracy import holding, known_part
 from odomap.lidar.icp import COST, COUNT, SLOTS, add_metric, add_plane, newton_step
 from odomap.lidar.planemap import (
     COARSER,
@@ -79,10 +79,6 @@ ASKED = 600
 """Points that say what is known: more say no more."""
 LEAST = 1e-9
 """Share of how points move that a motion moves them by at least, as turning about their line."""
-HELD = 1e4
-"""β, where a motion is seen by 1 at most."""
-LEVER = 2.0
-"""Metres that a body is moved as easily as it is turned by a radian."""
 UPPER = np.triu_indices(6)
 """Entries of a symmetric matrix as kernels sum them up."""
 
@@ -353,20 +349,11 @@ def _match(
     H, noise, motion, aged, bending = (_symmetric(row) for row in known)
     motion += LEAST * np.diag(np.repeat([motion[0, 0], np.trace(motion[3:, 3:])], 3))
     root, weak = known_part(H - noise, noise, motion, SEEN)
-    root, hold, tiny = turned.T @ root, _holding(motion, weak), LEAST * motion
+    root, hold, tiny = turned.T @ root, holding(weak, motion[0, 0]), LEAST * motion
     stays = turned.T @ np.linalg.solve(aged + tiny, H + tiny) @ turned
     bends = turned.T @ np.linalg.solve(H + hold + tiny, bending) @ turned
     match = PlaneMatch(T, root @ root.T, weak @ turned, stays, bends, on, mean, is_still)
     return match, hold
-
-
-def _holding(motion: Array, weak: Array) -> Array:
-    """Return what (6, 6) is added to H for the tangents (K, 6) to be held."""
-    if not len(weak):
-        return np.zeros((6, 6))
-    unlikely = motion[0, 0] * np.diag(np.repeat([1.0, LEVER**2], 3))
-    moved = unlikely @ weak.T
-    return np.asarray(HELD * moved @ np.linalg.solve(weak @ moved, moved.T))
 
 
 def _symmetric(total: Array) -> Array:
