@@ -17,7 +17,8 @@ length walls say nothing, it goes on as before and the covariance grows.
 A sweep that says nothing is lost; the body is taken to go on, and the next one that fits where it
 may be by then is where it goes on. Where nothing fits, or nothing was seen for long, it is looked
 for in the whole map (`cloudrecognition`), and after a while a piece of its own is begun, to be
-joined when it is recognised.
+joined when it is recognised. In a loaded map the first sweeps may not be recognised, bent as they
+are by a motion of which nothing is known; they are placed when a later one is.
 
 Reference: I. Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 8(2), 2023.
 """
@@ -29,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.errors import CalibrationError
-from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
+from odomap.geometry.lie import se3_adjoint, se3_exp, se3_inverse, se3_log
 from odomap.geometry.pose import SE3
 from odomap.geometry.so3 import orthonormalize
 from odomap.lidar.frontend import FrontEnd
@@ -54,6 +55,8 @@ ANEW = "started anew where it was last: how it moved since is not known"
 ASTRAY = "it may be anywhere: it was carried off, or not seen for long"
 UNKNOWN = np.zeros(6), np.zeros((6, 6))
 """A motion of which nothing is known, and its information."""
+WAITING = 9
+"""Sweeps before the first that is recognised in a map which are placed by how the body moved."""
 GLIMPSE_S = 0.5
 """Longest time between two sweeps that show how a body moves of which nothing else is known."""
 AGAIN, AS_BEFORE = 15, np.array([1e-2] * 3 + [1e-3] * 3)
@@ -109,6 +112,7 @@ class CloudTracker:
         self._is_astray = False
         self._first: CloudView | None = None
         self._glimpsed: CloudView | None = None
+        self._waiting: list[tuple[CloudView, tuple[Array, Array]]] = []
 
     def prepare(self, frame: Frame) -> CloudView:
         """Make a sweep ready, without looking at the map."""
@@ -157,11 +161,17 @@ class CloudTracker:
     def _begin(self, view: CloudView) -> Estimate:
         """Begin a map with a sweep, or find it in the one that there is."""
         if self._map.num_keyframes:
-            known = self._glimpse(view)
+            before, known = self._glimpsed, self._glimpse(view)
+            self._waiting = (
+                [*self._waiting[1 - WAITING :], (before, known)]
+                if before is not None and known is not UNKNOWN
+                else []
+            )
             found = self._finder.find(self._viewer.kept(view, known[0]))
             view.clock.lap("track")
             if isinstance(found, str):
                 return self._pass_over(view, f"not recognised: {found}")
+            self._place_late(view, found)
             return self._enter(view, found, Status.TRACKING, known)
         # How the body moved over it nobody knows yet, so nothing of it is kept.
         self._start(view)
@@ -182,6 +192,21 @@ class CloudTracker:
         laid = self._begin_again(before, view, seconds, laid)
         self._motion.know(laid.twist, laid.match.information * seconds**2)
         return self._motion.known
+
+    def _place_late(self, view: CloudView, found: FoundCloud) -> None:
+        """Place sweeps that nobody recognised, by how the body moved to one that is."""
+        k, T, late = found.keyframe_id, found.T_keyframe_body, []
+        covariance = np.asarray(np.linalg.inv(found.information))
+        stamp_ns = view.frame.stamp_ns
+        for before, (twist, information) in reversed(self._waiting):
+            seconds = (stamp_ns - before.frame.stamp_ns) * 1e-9
+            moved, stamp_ns = se3_exp(twist * seconds), before.frame.stamp_ns
+            T, Ad = T @ se3_inverse(moved), se3_adjoint(moved)
+            covariance = Ad @ covariance @ Ad.T + np.linalg.inv(information) * seconds**2
+            late.append(Placed(stamp_ns, k, T, covariance))
+        for placed in reversed(late):
+            self.path.append_late(placed)
+        self._waiting = []
 
     def _start(self, view: CloudView) -> None:
         """Begin the front-end's map with a sweep."""
