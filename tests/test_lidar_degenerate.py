@@ -69,11 +69,15 @@ def with_pillars(source, last):
     return Changed(source, "pillars", change)
 
 
-@pytest.mark.parametrize(("seed", "speed"), [(0, 2), (1, 4)])
-def test_in_a_tunnel_it_goes_on_as_it_came_in_and_the_covariance_grows(seed, speed):
+@pytest.mark.parametrize(
+    ("front_end", "seed", "speed"),
+    [("points", 0, 2), ("points", 1, 4), ("loam", 2, 4), ("lego", 1, 4)],
+)
+def test_in_a_tunnel_it_goes_on_as_it_came_in_and_the_covariance_grows(front_end, seed, speed):
     source = Kept("tunnel", 16, 80, seed, more=f"&speed={speed}")
     entered = with_pillars(source, 20)
-    estimates, _, result = played(entered, source.rig)
+    estimates, system = tracked(entered, source.rig, front_end)
+    result = system.finish()
     off, sigma = judge(estimates, source.truth.Ts_world_body), sigmas(estimates)
     assert all(e.status is Status.TRACKING for e in estimates)
     assert all(e.reason == "" for e in estimates[2:18])

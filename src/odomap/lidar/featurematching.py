@@ -54,6 +54,8 @@ GROSS = 9.0
 """Squares of this many s² and more are of something else."""
 SEEN = 0.0015
 """Share of a motion that must be seen beyond chance: tunnels show 0.0009, KITTI's roads 0.003."""
+ALONE = 3.0
+"""Features that say the same of a motion, below which they may all be astray."""
 STILL = 5e-4, 5e-5
 """What a step may be to be the last: metres, radians."""
 SAME = 0.01, 5e-4
@@ -157,7 +159,8 @@ def _lay(
     at = np.flatnonzero(on)
     p, e, n, spreads, own = pairs_of(points[at], kinds[at], rows[at], planes, edges, R, t)
     middle = p.mean(axis=0)
-    said = judge(p - middle, e, n, spreads, own, R, middle, False, SEEN)
+    least = max(SEEN, ALONE / float(own.sum()))
+    said = judge(p - middle, e, n, spreads, own, R, middle, False, least)
     return _Laid(T, moved, met, asked, middle, said)
 
 
