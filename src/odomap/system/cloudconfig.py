@@ -30,8 +30,8 @@ class CloudTrackingConfig:
     """Points beyond are not used, metres."""
     min_points: Count = 100
     """Points that must return for a sweep to say anything."""
-    min_share: Fraction = 0.25
-    """Share of the points that must lie on what is known."""
+    min_share: Fraction = 0.12
+    """Share of the points that must lie on what is known: 0.16 do on a field, of 16 beams."""
     rounds: Count = 2
     """How often a sweep is laid down, each time deskewed by the motion found before."""
     fastest: Positive = 60.0
