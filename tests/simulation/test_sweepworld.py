@@ -297,7 +297,7 @@ def test_a_box_before_a_wall_has_edges_and_the_wall_goes_on_behind_it() -> None:
         builder.build(), np.tile(np.eye(4), (2400, 1, 1)), np.zeros(2400), beams,
         np.zeros((2400, 1), np.float32), 0.0, 50.0,
     )  # fmt: skip
-    edge, hidden = (x[:, 0] for x in edges_of(distance, hit, normals, 2, 0.8))
+    edge, hidden = (x[:, 0] for x in edges_of(distance, hit, normals, beams, hit > 99, 2, 0.8))
     # The corners of the box and that of the walls are felt by two beams on either side, and where
     # the wall ends and nothing is behind it there is an edge, too.
     box, corner = np.arctan2(1.0, 4.5), np.arctan2(-6.0, 8.0)
@@ -310,3 +310,50 @@ def test_a_box_before_a_wall_has_edges_and_the_wall_goes_on_behind_it() -> None:
     behind = (np.abs(angle) > box) & (np.abs(angle) < box + 2 * step)
     np.testing.assert_array_equal(hidden, behind)
     np.testing.assert_allclose(distance[edge & ~at_corner, 0], 4.5 / np.cos(angle[on_box]), 1e-9)
+
+
+def seen_upwards(lowest: float, away: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether beams 1.2 degrees apart are on a wall above a floor, edges, and hidden."""
+    builder = SolidsBuilder(np.random.default_rng(0), Ground.none())
+    x, y, z = np.eye(3)
+    builder.rectangle(np.array([0.0, -9.0, -1.8]), x, y, (60.0, 18.0), "ground")
+    builder.rectangle(np.array([away, -9.0, lowest]), y, z, (18.0, 9.0), "building")
+    angle = np.radians(np.arange(-30.0, 5.0, 1.2))
+    beams = np.column_stack([np.cos(angle), np.full(len(angle), 1e-6), np.sin(angle)])[:, None]
+    solids, steps = builder.build(), len(angle)
+    distance, hit, normals = cast(
+        solids, np.tile(np.eye(4), (steps, 1, 1)), np.zeros(steps), beams,
+        np.zeros((steps, 1), np.float32), 0.0, 50.0,
+    )  # fmt: skip
+    on_wall = np.abs(normals[:, 0, 0]) > 0.5
+    edge, hidden = edges_of(distance, hit, normals, beams, hit > 99, 1, 0.8)
+    return on_wall, edge[:, 0], hidden[:, 0]
+
+
+@pytest.mark.parametrize("away", [5.0, 12.0, 25.0])
+def test_a_wall_on_the_floor_is_a_corner_however_far_beams_meet_from_each_other(
+    away: float,
+) -> None:
+    on_wall, edge, hidden = seen_upwards(-2.5, away)
+    border = np.flatnonzero(np.diff(on_wall))[0]
+    np.testing.assert_array_equal(np.flatnonzero(edge), [border, border + 1])
+    assert not hidden.any()
+
+
+@pytest.mark.parametrize("away", [5.0, 8.0])
+def test_a_wall_above_the_floor_hides_what_goes_on_below_it(away: float) -> None:
+    on_wall, edge, hidden = seen_upwards(-1.2, away)
+    border = np.flatnonzero(np.diff(on_wall))[0]
+    np.testing.assert_array_equal(np.flatnonzero(edge), [border + 1])
+    np.testing.assert_array_equal(np.flatnonzero(hidden), [border])
+
+
+def test_kerbs_are_ground(street: SweepWorld) -> None:
+    truth = street.sweep_truth(5)
+    kerb = truth.is_ground & (truth.kinds == KINDS.index("furniture"))
+    assert kerb.sum() > 20
+    assert np.abs(truth.normals[kerb, 2]).max() < 0.3  # upright
+    floor = truth.points[truth.is_ground & ~kerb]
+    for point in truth.points[kerb][::10]:
+        near = floor[np.linalg.norm(floor[:, :2] - point[:2], axis=1) < 1.5]
+        assert len(near) == 0 or np.abs(near[:, 2] - point[2]).min() < 0.2

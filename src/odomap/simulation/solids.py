@@ -105,7 +105,7 @@ class Solids:
         kinds: (N,) index of `KINDS`.
         albedos: (N,) share of the light that is thrown back.
         things: (N,) which thing a shape is a part of: all faces of a house have one number.
-        is_ground: (N,) whether one could drive or walk on it.
+        is_ground: (N,) whether one could drive or walk on it, or it is the kerb between the two.
         boxes: (M, 12) boxes of the left and of the right child of each node.
         nodes: (M, 4) of either child: a node, or -1 - first shape, and then how many.
         num_still: how many stand still.
@@ -195,7 +195,7 @@ class SolidsBuilder:
             thing: number from `thing`; 0 for one of its own.
             albedo: share of the light that is thrown back; 0 for what is usual of the kind.
             mover: number from `mover`, or -1 if it stands still.
-            is_ground: whether one could drive or walk on it.
+            is_ground: whether one could drive or walk on it, or it is the kerb between the two.
         """
         u, v = u / np.sqrt(u @ u), v / np.sqrt(v @ v)
         n = np.array(

@@ -29,7 +29,7 @@ from odomap.simulation.path import Path
 from odomap.simulation.scanner import Measured, Scanner, measure
 from odomap.simulation.solidcast import GROUND, cast
 from odomap.simulation.solidrooms import solid_building, solid_room
-from odomap.simulation.solids import ALBEDO, Solids
+from odomap.simulation.solids import ALBEDO, RECTANGLE, Solids
 from odomap.simulation.sweepspec import HAND_HELD, NEAREST_M, SweepSpec
 from odomap.simulation.sweeptruth import SweepTruth, edges_of
 from odomap.simulation.town import field, town, tunnel
@@ -114,7 +114,10 @@ class SweepWorld:
             IndexError: there is no such frame.
         """
         measured, directions, distance, hit, normals, R_world_lidar = self._measured(index)
-        edge, hidden = edges_of(distance, hit, normals, reach, np.cos(np.radians(bend_deg)))
+        rays = np.einsum("sij,sbj->sbi", R_world_lidar, directions)
+        forms = np.append(self.solids.forms, [RECTANGLE, RECTANGLE])  # -2 and -1 are the last
+        bend = np.cos(np.radians(bend_deg))
+        edge, hidden = edges_of(distance, hit, normals, rays, forms[hit] != RECTANGLE, reach, bend)
         rows = measured.rows
         who = hit.ravel()[rows]
         local = np.einsum("sij,sbi->sbj", R_world_lidar, normals)

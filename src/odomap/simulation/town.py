@@ -135,8 +135,9 @@ def _pavement(street: _Street, side: float) -> None:
         kerb = corner if side > 0 else corner + unit_l * 3.2
         down = np.cross(unit_a, unit_l)
         street.builder.rectangle(
-            kerb - 0.16 * down, unit_a, down, (long, 0.16), "furniture", thing=thing, albedo=0.4
-        )
+            kerb - 0.16 * down, unit_a, down, (long, 0.16), "furniture", thing=thing, albedo=0.4,
+            is_ground=True,
+        )  # fmt: skip
 
 
 def _houses(street: _Street, side: float) -> None:
