@@ -86,18 +86,33 @@ def test_ground_is_the_ground(seed, beams):
     assert not np.any(found.ground & (found.marks == EDGE))
 
 
+@pytest.mark.parametrize(("seed", "beams"), [(3, 16), (5, 16), (4, 32)])
+def test_ground_of_few_beams_is_the_ground_too(seed, beams):
+    sweep, truth = seen("street", seed, beams)
+    found = LegoFrontEnd().prepare(sweep)
+    assert found.ground.sum() > 200 * beams
+    assert truth.is_ground[sweep.rows][found.ground].mean() >= 0.96
+
+
 @pytest.mark.parametrize("make", FRONT_ENDS)
-def test_a_solid_state_pattern_has_labels_too(make):
-    sweep, truth = seen("street", 2, 6, "solid_state")
+@pytest.mark.parametrize(("seed", "index"), [(2, 20), (4, 100), (5, 20), (8, 60), (9, 33)])
+def test_a_solid_state_pattern_has_labels_too(make, seed, index):
+    spec = SweepSpec(seed=seed, frames=index + 1, beams=16, pattern="solid_state")
+    world = SweepWorld(spec)
+    sweep = points_of(world.frame(index).cloud, world.rig.lidars[0])
+    truth = world.sweep_truth(index, reach=3)
     assert not scan_lines(sweep, np.eye(4)).turns
     found = make().prepare(sweep)
     edges, planes = found.marks == EDGE, found.marks == PLANE
+    is_leaf = truth.kinds[sweep.rows] == LEAVES
     right = truth.is_edge[sweep.rows] | is_border(sweep, truth)
-    assert edges.sum() > 30
-    assert right[edges].mean() >= 0.9
+    assert edges.sum() > 40
+    assert right[edges & ~is_leaf].mean() >= 0.95
     off = np.einsum("ni,ni->n", sweep.points - truth.points[sweep.rows], truth.normals[sweep.rows])
-    assert planes.sum() > 200
-    assert np.mean(np.abs(off[planes]) < 0.06) >= 0.97
+    ranges = np.linalg.norm(sweep.points, axis=1)
+    in_plane = (np.abs(off) < 0.05 * (1 + ranges / 50)) & ~truth.is_edge[sweep.rows]
+    assert planes.sum() > 900
+    assert in_plane[planes].mean() >= 0.92  # of one sweep; the benchmark has 0.95 of four
 
 
 def test_a_corner_is_found_where_it_is_and_what_hides_it_is_not_an_edge():

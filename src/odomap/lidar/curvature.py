@@ -10,12 +10,12 @@ any sensor (LOAM divides by |X| instead, and takes d, which is not 0 where point
 side). k spans a baseline, so that noise does not look like an edge close by, nor do edges where d⊥
 is within the noise count. Sums along the line give both means at once, whatever k is.
 
-A line breaks where neighbours are too far apart to be of one surface. What is behind there is left
-out, since where it ends only depends on what hides it; what is in front is an edge, and so is a
-post, thin with breaks on both sides. Surfaces along the beam are left out, and leaves, among which
-a line is not smooth. What of all that is used is picked elsewhere (`featurepicking`).
+A line breaks where it leaves a surface (`breaks`). What is behind there is left out, since where it
+ends only depends on what hides it; what is in front is an edge, and so is a post, thin with breaks
+on both sides. Surfaces along the beam are left out, and leaves, among which a line is not smooth.
+What of all that is used is picked elsewhere (`featurepicking`).
 
-Cost: 30 ns a point.
+Cost: 50 ns a point.
 
 Reference: J. Zhang, S. Singh, "LOAM: lidar odometry and mapping in real-time", RSS 2014, section V.
 """
@@ -25,27 +25,23 @@ from numpy.typing import NDArray
 
 from odomap.geometry.pnp_kernels import cholesky_solve
 from odomap.kernels import kernel
+from odomap.lidar.breaks import JOINED, find_breaks, is_before
 from odomap.lidar.featureconfig import CurvatureConfig
 from odomap.lidar.scanlines import ScanLines
 
-__all__ = ["CUT", "FAR_MORE", "FRONT", "curvatures", "is_smooth", "warm_up"]
+__all__ = ["CUT", "FRONT", "curvatures", "is_smooth", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Marks = NDArray[np.uint8]
 
-JOINED, BEHIND, BEFORE, UNKNOWN = 0, 1, 2, 3
-"""What is between a point and the next: one surface; the next is behind, or in front; nothing."""
 SURE = 4.0
 """How many standard deviations of the noise an edge stands out."""
-STEEP = 0.2
-"""Sine of the angle with the beam up to which neighbours of one surface are told from a break."""
-FAR_MORE = 2.5
-"""How many times farther it is across an end than along a surface."""
 FEWEST_OF_A_POST = 3
 """Points of a post: one or two in front of all others may be stray."""
-ON_PLANE = 2.0
-"""How many standard deviations of the noise points are off a plane that fits them."""
+ON_PLANE, BY_PLANE = 1.5, 2.0
+"""How many standard deviations of the noise points are off a plane that fits them, and up to which
+it may yet be one, so that there is no edge either."""
 AROUND = 3
 """Points to either side through which it is laid."""
 RIDGE = 1e-9
@@ -72,29 +68,8 @@ def curvatures(lines: ScanLines, config: CurvatureConfig) -> tuple[Array, Index]
             config.thin, c[part], reach[part],
         )  # fmt: skip
         if not lines.turns:
-            _unbend(lines.points[part], AROUND, config.noise, config.flat, c[part])
+            _unbend(lines.points[part], AROUND, config.noise, config.sharp, config.flat, c[part])
     return c, reach
-
-
-@kernel
-def _breaks(
-    p: Array, ranges: Array, step: float, gap: float, missing: float, breaks: Marks
-) -> None:
-    """What is between each point and the next: |p' - p| > gap + r θ / sin is no surface."""
-    for n in range(p.shape[0] - 1):
-        dx, dy, dz = p[n + 1, 0] - p[n, 0], p[n + 1, 1] - p[n, 1], p[n + 1, 2] - p[n, 2]
-        near, far = min(ranges[n], ranges[n + 1]), max(ranges[n], ranges[n + 1])
-        chord2 = dx * dx + dy * dy + dz * dz
-        theta = np.sqrt(max(chord2 - (far - near) ** 2, 0.0) / (near * far + 1e-12))
-        if theta > missing * step:
-            breaks[n] = UNKNOWN
-            limit = gap + near * step
-        else:
-            breaks[n] = BEHIND if ranges[n + 1] > ranges[n] else BEFORE
-            limit = gap + near * theta / STEEP
-        if chord2 <= limit * limit:
-            breaks[n] = JOINED
-    breaks[p.shape[0] - 1] = UNKNOWN
 
 
 @kernel
@@ -110,7 +85,7 @@ def _curvatures(
         ranges[n] = np.sqrt(x * x + y * y + z * z)
         sums[n + 1, 0], sums[n + 1, 1] = sums[n, 0] + x, sums[n, 1] + y
         sums[n + 1, 2] = sums[n, 2] + z
-    _breaks(p, ranges, step, gap, missing, breaks)
+    find_breaks(p, ranges, step, gap, missing, noise, breaks)
     begin, end = 0, 0
     while begin < count:  # a piece without breaks after the other
         end = begin + 1
@@ -164,25 +139,6 @@ def _bend(
 
 
 @kernel
-def _is_behind(p: Array, ranges: Array, n: int, way: int, gap: float) -> bool:
-    """Whether what follows an end of a piece is a surface behind it, and the end is no stray point.
-
-    The way to it is far longer than that to the point before, and than the next one behind.
-    """
-    a, b, c, before = n + way, n + 2 * way, n + 3 * way, n - way
-    if c < 0 or c >= p.shape[0]:
-        return False
-    if min(ranges[a], min(ranges[b], ranges[c])) < ranges[n] + 0.5 * gap:
-        return False
-    jump, inner, outer = 0.0, 0.0, 0.0
-    for i in range(3):
-        jump += (p[a, i] - p[n, i]) ** 2
-        inner += (p[n, i] - p[before, i]) ** 2
-        outer += (p[b, i] - p[a, i]) ** 2
-    return bool(jump > FAR_MORE * FAR_MORE * max(inner, outer))
-
-
-@kernel
 def is_smooth(p: Array, n: int, way: int, k: int, noise: float) -> bool:
     """Whether k steps along the line lead about straight away, as they do not among leaves."""
     path, straight = 0.0, 0.0
@@ -206,8 +162,8 @@ def _ends(
     count, last = end - begin, end - 1
     if count == 1:
         return
-    before = begin > 0 and breaks[begin - 1] == BEFORE and _is_behind(p, ranges, begin, -1, gap)
-    after = breaks[last] == BEHIND and _is_behind(p, ranges, last, 1, gap)
+    before = is_before(p, ranges, breaks, begin, -1, gap)
+    after = is_before(p, ranges, breaks, last, 1, gap)
     x, y, z = p[last, 0] - p[begin, 0], p[last, 1] - p[begin, 1], p[last, 2] - p[begin, 2]
     if before and after and x * x + y * y + z * z < thin * thin:
         if count >= FEWEST_OF_A_POST:
@@ -234,8 +190,8 @@ def _ends(
 
 
 @kernel
-def _unbend(p: Array, k: int, noise: float, flat: float, c: Array) -> None:
-    """c ← at most `flat` where a line that itself is curved lies in a plane.
+def _unbend(p: Array, k: int, noise: float, sharp: float, flat: float, c: Array) -> None:
+    """c ← at most `flat` where a line that itself is curved lies in a plane, no edge where it may.
 
     On a plane nᵀ X = d the inverse range is linear in the direction u, 1/r = (n/d)ᵀ u. Where that
     fits 2k + 1 points to within the noise they are of one plane, however the beam went.
@@ -262,10 +218,11 @@ def _unbend(p: Array, k: int, noise: float, flat: float, c: Array) -> None:
             along = a[0] * p[j, 0] + a[1] * p[j, 1] + a[2] * p[j, 2]  # 1 on the plane
             r = np.sqrt(p[j, 0] ** 2 + p[j, 1] ** 2 + p[j, 2] ** 2)
             square += ((1.0 - along) * r) ** 2 / (2 * k - 2)
-        limit = ON_PLANE * noise * (1.0 + mean / 50.0)
-        off = np.sqrt(square) / limit
-        if off < 1.0:
-            c[n] = min(abs(c[n]), 0.999 * flat * off)
+        off = np.sqrt(square) / (noise * (1.0 + mean / 50.0))
+        if off < ON_PLANE:
+            c[n] = min(abs(c[n]), 0.999 * flat * off / ON_PLANE)
+        elif off < BY_PLANE and c[n] >= sharp:
+            c[n] = 0.999 * sharp
 
 
 def warm_up() -> None:

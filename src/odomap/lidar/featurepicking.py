@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.curvature import CUT, FAR_MORE, FRONT, is_smooth
+from odomap.lidar.breaks import FAR_MORE
+from odomap.lidar.curvature import CUT, FRONT, is_smooth
 from odomap.lidar.featureconfig import CurvatureConfig
 from odomap.lidar.scanlines import ScanLines
 
