@@ -7,9 +7,9 @@ from odomap.geometry.lie import se3_exp, se3_inverse, se3_log
 from odomap.lidar.cloudconfig import PointsConfig
 from odomap.lidar.deskew import deskew
 from odomap.lidar.planefrontend import PlaneFrontEnd, suitable_voxel
-from odomap.lidar.planemap import COARSER, PlaneMap
+from odomap.lidar.planemap import PlaneMap
 from odomap.lidar.sweeps import SweepPoints
-from odomap.lidar.voxels import first_in_voxels
+from odomap.lidar.voxels import COARSER, first_in_voxels
 
 SIDES = np.array([12.0, 8.0, 3.0])
 

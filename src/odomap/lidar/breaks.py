@@ -13,9 +13,9 @@ beam of the second at r₁₂,
 
     s₁ = r₁₂ - r₂,   s₂ = r₂₁ - r₁:    the first hides the second where s₁ < 0 < s₂
 
-by more than noise makes; both positive are a corner seen from within, as
-where a wall meets the floor, both negative one from without: there the surfaces meet. A point
-astray by x makes a step of 2x, so on both sides a third point must lie on the line to half of that.
+by more than noise makes; both positive are a corner seen from within, as where a wall meets the
+floor, both negative one from without: there the surfaces meet. A point astray by x makes a step of
+2x, so on both sides a third point must lie on the line to half of that.
 
 Cost: 20 ns a point.
 

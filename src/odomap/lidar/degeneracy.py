@@ -30,7 +30,7 @@ from odomap.geometry.so3 import hat
 from odomap.kernels import kernel
 from odomap.lidar.icp import SLOTS, add_plane
 
-__all__ = ["Certainty", "holding", "judge", "known_part", "named", "warm_up"]
+__all__ = ["UPPER", "Certainty", "holding", "judge", "known_part", "named", "symmetric", "warm_up"]
 
 Array = NDArray[np.float64]
 
@@ -43,6 +43,8 @@ EXACT = 1e-9
 """Least σ, as a share of the cloud's radius: exact clouds have no noise to scale with."""
 HELD = 1e4
 """β, where a motion is seen by 1 at most."""
+UPPER = np.triu_indices(6)
+"""Entries of a symmetric matrix in the order in which kernels sum them up."""
 LEVER = 2.0
 """Metres that a body is moved as easily as it is turned by a radian."""
 PLANE = (0, 1, 5)
@@ -93,9 +95,9 @@ def judge(
         return Certainty(nothing, np.eye(len(free)), error, "hardly any surface was met")
     radius = max(float(np.sqrt(np.mean(p * p) * 3.0)), 1e-12)
     variance = max(_variance(squares[:known], len(free)), (EXACT * radius) ** 2)
-    noise = _motion(sums[3]) - _symmetric(sums[1])
+    noise = _motion(sums[3]) - symmetric(sums[1])
     motion = _motion(sums[2]) + known * 1e-12 * np.diag([1.0] * 3 + [radius * radius] * 3)
-    fits = _symmetric(sums[0]) - noise
+    fits = symmetric(sums[0]) - noise
     noise, motion, fits = (M[np.ix_(free, free)] / known for M in (noise, motion, fits))
     root, weak = known_part(fits, noise, motion, least)
     shift = np.eye(6)
@@ -174,10 +176,10 @@ def _sum_fits(
     return known
 
 
-def _symmetric(total: Array) -> Array:
+def symmetric(total: Array) -> Array:
     """Return (6, 6) of its 21 entries above the diagonal."""
     M = np.zeros((6, 6))
-    M[np.triu_indices(6)] = total[:21]
+    M[UPPER] = total[:21]
     return M + np.triu(M, 1).T
 
 

@@ -28,9 +28,19 @@ from numpy.typing import NDArray
 from odomap.errors import InputError
 from odomap.kernels import kernel
 from odomap.lidar.normals import eigenvalues, longest_cross
-from odomap.lidar.voxels import FURTHEST, axis_of_key, new_table, rehash_kernel, sum_cells
+from odomap.lidar.voxels import (
+    COARSER,
+    FAR_AWAY,
+    FURTHEST,
+    axis_of_key,
+    level_of_key,
+    near_cells,
+    new_table,
+    rehash_kernel,
+    sum_cells,
+)
 
-__all__ = ["AXIS", "COARSER", "FAR_AWAY", "MEAN", "SHAPE", "SPREAD", "VoxelShapes", "warm_up"]
+__all__ = ["AXIS", "MEAN", "SHAPE", "SPREAD", "VoxelShapes", "warm_up"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -38,10 +48,6 @@ Index = NDArray[np.int64]
 MEAN, AXIS, SPREAD, SHAPE = 0, 3, 6, 10
 """Columns of a shape: μ; normal or direction; n (0: none), thin λ, wide λ, widest λ. How many."""
 FIRST_ROOM = 4096
-COARSER = 3
-"""Size of large voxels in small ones."""
-FAR_AWAY = FURTHEST // 2
-"""Where along x large voxels are in the table, in voxels; small ones stay nearer."""
 FEWEST = 6
 """Points of a plane or an edge."""
 PLANE_RATIO, EDGE_RATIO = 0.05, 0.08
@@ -119,9 +125,9 @@ class VoxelShapes:
 
     def forget(self, centre: Array, radius: float) -> None:
         """Forget voxels farther than a distance from a point (3,)."""
-        near = np.empty(self._size, np.bool_)
-        _near_kernel(self._keys, self.voxel, centre, radius, near)
-        rows = np.flatnonzero(near)
+        rows = np.empty(self._size, np.int64)
+        keys = self._keys[: self._size]
+        rows = rows[: near_cells(keys, self.voxel, centre, radius, rows)]
         if len(rows) < self._size:
             self._keep(rows, len(self._keys))
 
@@ -158,10 +164,9 @@ def fit_kernel(
         least, middle, largest = eigenvalues(a, b, c, d, e, f)
         root = largest if is_edges else least
         u, q, w, n2 = longest_cross(a - root, b, c, d - root, e, f - root)
-        far = axis_of_key(keys[v], 0)
-        side = COARSER if far > FAR_AWAY // 2 else 1
-        far = far - FAR_AWAY if side > 1 else far
-        square = float(side * side)
+        far, side = level_of_key(keys[v], size)
+        shrunk = side / size  # what lies in large voxels was shrunk as they are
+        square = shrunk * shrunk
         least, middle, largest = square * max(least, 0.0), square * middle, square * largest
         thin, wide = (max(middle, 0.0), largest) if is_edges else (least, middle)
         if thin > thickness * thickness or thin > (EDGE_RATIO if is_edges else PLANE_RATIO) * wide:
@@ -170,27 +175,11 @@ def fit_kernel(
             continue
         scale = 1.0 / np.sqrt(n2)
         shapes[v, AXIS], shapes[v, AXIS + 1], shapes[v, AXIS + 2] = u * scale, q * scale, w * scale
-        shapes[v, MEAN] = side * ((far + 0.5) * size + x)
-        shapes[v, MEAN + 1] = side * ((axis_of_key(keys[v], 1) + 0.5) * size + y)
-        shapes[v, MEAN + 2] = side * ((axis_of_key(keys[v], 2) + 0.5) * size + z)
+        shapes[v, MEAN] = (far + 0.5) * side + shrunk * x
+        shapes[v, MEAN + 1] = (axis_of_key(keys[v], 1) + 0.5) * side + shrunk * y
+        shapes[v, MEAN + 2] = (axis_of_key(keys[v], 2) + 0.5) * side + shrunk * z
         shapes[v, SPREAD], shapes[v, SPREAD + 1] = n, thin
         shapes[v, SPREAD + 2], shapes[v, SPREAD + 3] = wide, largest
-
-
-@kernel
-def _near_kernel(
-    keys: Index, size: float, centre: Array, radius: float, near: NDArray[np.bool_]
-) -> None:
-    """Which voxels have their middle within a radius."""
-    for v in range(near.shape[0]):
-        far = axis_of_key(keys[v], 0)
-        side = COARSER if far > FAR_AWAY // 2 else 1
-        far = far - FAR_AWAY if side > 1 else far
-        square = (side * (far + 0.5) * size - centre[0]) ** 2
-        for axis in range(1, 3):
-            off = side * (axis_of_key(keys[v], axis) + 0.5) * size - centre[axis]
-            square += off * off
-        near[v] = square <= radius * radius
 
 
 def warm_up() -> None:

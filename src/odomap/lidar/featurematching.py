@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.degeneracy import Certainty, holding, judge
-from odomap.lidar.featuremap import AXIS, COARSER, FAR_AWAY, MEAN, SPREAD, VoxelShapes
+from odomap.lidar.degeneracy import UPPER, Certainty, holding, judge
+from odomap.lidar.featuremap import AXIS, MEAN, SPREAD, VoxelShapes
 from odomap.lidar.featurepairs import (
     ALL,
     EDGES,
@@ -38,7 +38,7 @@ from odomap.lidar.featurepairs import (
 )
 from odomap.lidar.frontend import SweepMatch
 from odomap.lidar.icp import COUNT, SLOTS, add_metric, add_plane, newton_step
-from odomap.lidar.voxels import key_of, slot_of
+from odomap.lidar.voxels import COARSER, FAR_AWAY, key_of, slot_of
 
 __all__ = ["ALL", "EDGES", "GROUND", "PLANES", "FeatureStage", "match_features", "warm_up"]
 
@@ -147,7 +147,7 @@ def _lay(
     rows, squares = np.full(len(points), -1, np.int64), np.zeros(len(points))
     moved = _match(
         points, kinds, rules, planes.table, planes.shapes, planes.voxel, edges.table, edges.shapes,
-        edges.voxel, hold[np.triu_indices(6)], R, t, rows, squares,
+        edges.voxel, hold[UPPER], R, t, rows, squares,
     )  # fmt: skip
     on = (rows >= 0) & (squares < GROSS)
     met = int(np.count_nonzero(on))
@@ -282,6 +282,15 @@ def _sum(
 
 
 @kernel
+def _misfit(rows: Index, squares: Array) -> float:
+    """Σ min(r², what is gross at first) of features, those that lie on nothing counted as gross."""
+    most, misfit = GROSS * WIDE * WIDE, 0.0
+    for i in range(rows.shape[0]):
+        misfit += min(squares[i], most) if rows[i] >= 0 else most
+    return misfit
+
+
+@kernel
 def _hold(total: Array, held: int) -> None:
     """Make H and g those of the directions that are not held."""
     if held == 0:
@@ -311,17 +320,16 @@ def _match(
         wanted, held, reach = int(stages[stage, 0]), int(stages[stage, 1]), stages[stage, 2]
         glanced, is_new = 0 if stage == stages.shape[0] - 1 else GLANCED, True
         if wanted == ALL and stage > 0 and int(stages[stage - 1, 0]) != ALL:
-            misfit, most = np.zeros(2), GROSS * WIDE * WIDE
+            misfits = np.empty(2)
             for at in range(2):
                 R_at, t_at = R if at else R_0, t if at else t_0
                 _meet(
                     points, kinds, ALL, GLANCED, reach * reach, planes_table, planes, planes_size,
                     edges_table, edges, edges_size, R_at, t_at, rows,
                 )  # fmt: skip
-                _sum(points, kinds, rows, planes, edges, R_at, t_at, most, squares, total)
-                for i in range(points.shape[0]):
-                    misfit[at] += min(squares[i], most) if rows[i] >= 0 else most
-            if misfit[0] < misfit[1]:
+                _sum(points, kinds, rows, planes, edges, R_at, t_at, kappa2, squares, total)
+                misfits[at] = _misfit(rows, squares)
+            if misfits[0] < misfits[1]:
                 R[:], t[:], kappa2 = R_0, t_0, WIDE * WIDE
         for step in range(int(stages[stage, 3])):
             if is_new:

@@ -27,17 +27,19 @@ from numpy.typing import NDArray
 from odomap.kernels import kernel
 from odomap.lidar.normals import eigenvalues, longest_cross
 from odomap.lidar.voxels import (
+    COARSER,
+    FAR_AWAY,
     FURTHEST,
     axis_of_key,
     key_of,
+    level_of_key,
+    near_cells,
     new_table,
     rehash_kernel,
     slot_of,
 )
 
 __all__ = [
-    "COARSER",
-    "FAR_AWAY",
     "NONE",
     "NORMAL",
     "OLD",
@@ -54,10 +56,6 @@ Flags = NDArray[np.int8]
 
 OLD, NONE, SURFACE = np.int8(0), np.int8(1), np.int8(2)
 """What is known of a voxel: its plane is to be found again, there is none, or it is there."""
-COARSER = 3
-"""Size of large voxels in small ones."""
-FAR_AWAY = FURTHEST // 2
-"""Where along x large voxels are in the table, in voxels; small ones stay nearer."""
 TILT, NORMAL, PLANE = 3, 4, 8
 """Columns of a voxel's plane after its mean: how far its normal may be tilted, δ², radians squared;
 where the normal begins, |n|² after it; and how many there are, as many as are fetched at once."""
@@ -80,9 +78,7 @@ def plane_kernel(v: int, key: int, size: float, sums: Array, sigma2: float, plan
     n = sums[v, 0]
     if n < FEWEST:
         return False
-    i = axis_of_key(key, 0)
-    if i > FAR_AWAY // 2:
-        i, size = i - FAR_AWAY, size * COARSER
+    i, size = level_of_key(key, size)
     x, y, z = sums[v, 1] / n, sums[v, 2] / n, sums[v, 3] / n
     planes[v, 0], planes[v, 1] = x + (i + 0.5) * size, y + (axis_of_key(key, 1) + 0.5) * size
     planes[v, 2] = z + (axis_of_key(key, 2) + 0.5) * size
@@ -149,23 +145,6 @@ def _insert_kernel(
     return points.shape[0], count
 
 
-@kernel
-def _near_kernel(keys: Index, size: float, centre: Array, distance: float, near: Index) -> int:
-    """near ← voxels whose middle is within a distance; returns how many."""
-    count = 0
-    for v in range(keys.shape[0]):
-        i, side = axis_of_key(keys[v], 0), size
-        if i > FAR_AWAY // 2:
-            i, side = i - FAR_AWAY, size * COARSER
-        x = (i + 0.5) * side - centre[0]
-        y = (axis_of_key(keys[v], 1) + 0.5) * side - centre[1]
-        z = (axis_of_key(keys[v], 2) + 0.5) * side - centre[2]
-        if x * x + y * y + z * z <= distance * distance:
-            near[count] = v
-            count += 1
-    return count
-
-
 class PlaneMap:
     """Surfaces around a body.
 
@@ -214,7 +193,7 @@ class PlaneMap:
     def evict(self, centre: Array, distance: float) -> int:
         """Forget voxels farther than a distance from a point (3,); return how many."""
         near = np.empty(self._size, np.int64)
-        near = near[: _near_kernel(self.keys[: self._size], self.voxel, centre, distance, near)]
+        near = near[: near_cells(self.keys[: self._size], self.voxel, centre, distance, near)]
         gone = self._size - len(near)
         if gone:
             self._keep(near, max(FIRST_ROOM, len(near) + len(near) // 2))

@@ -29,11 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odomap.kernels import kernel
-from odomap.lidar.degeneracy import holding, known_part
+from odomap.lidar.degeneracy import UPPER, holding, known_part, symmetric
 from odomap.lidar.icp import COST, COUNT, SLOTS, add_metric, add_plane, newton_step
 from odomap.lidar.planemap import (
-    COARSER,
-    FAR_AWAY,
     NONE,
     NORMAL,
     OLD,
@@ -43,7 +41,7 @@ from odomap.lidar.planemap import (
     PlaneMap,
     plane_kernel,
 )
-from odomap.lidar.voxels import key_of, slot_of
+from odomap.lidar.voxels import COARSER, FAR_AWAY, key_of, slot_of
 
 __all__ = ["PlaneMatch", "lying", "match_planes"]
 
@@ -79,8 +77,6 @@ ASKED = 600
 """Points that say what is known: more say no more."""
 LEAST = 1e-9
 """Share of how points move that a motion moves them by at least, as turning about their line."""
-UPPER = np.triu_indices(6)
-"""Entries of a symmetric matrix as kernels sum them up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +342,7 @@ def _match(
     if _known_kernel(points, met, bent, float(s.sweeps), R, t, s.planes, s.sums, known) < FEWEST:
         none = np.zeros((6, 6))
         return PlaneMatch(T, none, np.eye(6), np.eye(6), none, on, mean, False), hold
-    H, noise, motion, aged, bending = (_symmetric(row) for row in known)
+    H, noise, motion, aged, bending = (symmetric(row) for row in known)
     motion += LEAST * np.diag(np.repeat([motion[0, 0], np.trace(motion[3:, 3:])], 3))
     root, weak = known_part(H - noise, noise, motion, SEEN)
     root, hold, tiny = turned.T @ root, holding(weak, motion[0, 0]), LEAST * motion
@@ -354,13 +350,6 @@ def _match(
     bends = turned.T @ np.linalg.solve(H + hold + tiny, bending) @ turned
     match = PlaneMatch(T, root @ root.T, weak @ turned, stays, bends, on, mean, is_still)
     return match, hold
-
-
-def _symmetric(total: Array) -> Array:
-    """Return (6, 6) of its 21 entries above the diagonal."""
-    M = np.zeros((6, 6))
-    M[UPPER] = total[:21]
-    return M + np.triu(M, 1).T
 
 
 def warm_up() -> None:

@@ -13,6 +13,8 @@ points are spread: with u = p - (the cell's centre)
 Sums of neighbouring cells are added after a shift of the centre, so that the spread of all points
 around a cell costs 27 look-ups, however many points there are.
 
+A table can hold cells of two sizes, the large ones far away along x, where no small one is.
+
 Cost: 25 ns per point.
 
 Reference: M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
@@ -28,6 +30,8 @@ from odomap.errors import InputError
 from odomap.kernels import kernel
 
 __all__ = [
+    "COARSER",
+    "FAR_AWAY",
     "FURTHEST",
     "Cells",
     "axis_of_key",
@@ -35,7 +39,9 @@ __all__ = [
     "first_in_voxels",
     "into_cells",
     "key_of",
+    "level_of_key",
     "mean_points",
+    "near_cells",
     "new_table",
     "rehash_kernel",
     "slot_of",
@@ -48,6 +54,10 @@ Index = NDArray[np.int64]
 
 FURTHEST = 1 << 20
 """Cells beyond this many from the origin along an axis cannot be told apart."""
+COARSER = 3
+"""Size of large cells in small ones, where a table holds both."""
+FAR_AWAY = FURTHEST // 2
+"""Where along x large cells are in it, in cells; small ones stay nearer than half of that."""
 _MASK = (1 << 21) - 1
 _MIXER = 0x1E3779B97F4A7C15
 
@@ -90,6 +100,30 @@ def key_of(i: int, j: int, k: int) -> int:
 def axis_of_key(key: int, axis: int) -> int:
     """Its place along one axis, 0 to 2."""
     return ((key >> (21 * axis)) & _MASK) - FURTHEST
+
+
+@kernel
+def level_of_key(key: int, size: float) -> tuple[int, float]:
+    """Its place along x among cells of its size, and that size, where a table holds two."""
+    i = axis_of_key(key, 0)
+    if i > FAR_AWAY // 2:
+        return i - FAR_AWAY, size * COARSER
+    return i, size
+
+
+@kernel
+def near_cells(keys: Index, size: float, centre: Array, distance: float, near: Index) -> int:
+    """near ← cells of either size whose middle is within a distance; returns how many."""
+    count = 0
+    for cell in range(keys.shape[0]):
+        i, side = level_of_key(keys[cell], size)
+        x = (i + 0.5) * side - centre[0]
+        y = (axis_of_key(keys[cell], 1) + 0.5) * side - centre[1]
+        z = (axis_of_key(keys[cell], 2) + 0.5) * side - centre[2]
+        if x * x + y * y + z * z <= distance * distance:
+            near[count] = cell
+            count += 1
+    return count
 
 
 @kernel
@@ -254,3 +288,4 @@ def warm_up() -> None:
     rehash_kernel(cells.keys, 1, new_table(1))
     mean_points(cells.keys, cells.sums, 1.0, points)
     first_in_voxels(points, 1.0)
+    near_cells(cells.keys, 1.0, np.zeros(3), 1.0, np.empty(len(cells), np.int64))
